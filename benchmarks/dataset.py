@@ -13,6 +13,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
 from endopilot.devices.device import read_wire
+from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
 from endopilot.runs import claim
@@ -58,6 +59,8 @@ def bench_dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: A
     generate_dataset(folders, output=output / "dataset", device=read_wire(_DEVICE), config=config)
     record = read_json(output / "dataset" / MANIFEST_PATH)
     work, files = record["work"], [file for file in (output / "dataset").rglob("*") if file.is_file()]
+    if not work["samples"]:
+        raise InputError(f"{output}: was finished by a run that simulated nothing; choose another folder")
     samples = count * size * config.samples
     full = PAPER_ANATOMIES * PAPER_SEQUENCES * config.samples
     cost, stored = work["processor_seconds"] / work["samples"], sum(file.stat().st_size for file in files) / samples

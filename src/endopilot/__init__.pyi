@@ -89,7 +89,6 @@ from .simulation.simulator import Simulator as Simulator
 from .simulation.state import SimulationSetUp as SimulationSetUp
 from .simulation.state import SimulatorState as SimulatorState
 from .simulation.state import Step as Step
-from .simulation.state import SupportsDLPack as SupportsDLPack
 from .simulation.tip_load import TipLoadTest as TipLoadTest
 from .simulation.tip_load import simulate_tip_load as simulate_tip_load
 from .simulation.trajectory import Trajectory as Trajectory

@@ -78,17 +78,6 @@ def test_a_helix_has_its_curvature_and_torsion():
     assert radius == pytest.approx(np.ones(len(radius)))
 
 
-def test_sharp_bends_are_counted():
-    # Two half circles of 3 mm between straight lines: curvature 1/3 over 9.4 mm each, 127 mm in all.
-    arc = np.linspace(0.0, np.pi, 40)[1:]
-    up = np.stack([3 - 3 * np.cos(arc), 3 * np.sin(arc), np.zeros(39)], axis=1)
-    pieces = [straight((0, -36, 0), (0, 1, 0), 36), up, straight((6, -0.25, 0), (0, -1, 0), 36)]
-    down = np.stack([9 - 3 * np.cos(arc), -36.25 - 3 * np.sin(arc), np.zeros(39)], axis=1)
-    line = np.concatenate([*pieces, down, straight((12, -36, 0), (0, 1, 0), 36)])
-    shape = vessel_shape(anatomy_of([(line, constant(line, 1.0), -1, 0)]))
-    assert shape["curvature peaks > 0.2 in 100 mm"][0] == pytest.approx(200 / 121, rel=0.05)
-
-
 @pytest.mark.parametrize(("side", "gives_way"), [(60.0, 0.0), (35.0, 20.0), (95.0, 10.0)])
 def test_a_fork_has_its_angles_and_calibre(side, gives_way):
     across = np.deg2rad([-gives_way, side])
@@ -124,29 +113,6 @@ def test_the_left_mains_fork_is_measured_by_its_sections():
     assert "LM→LAD turn, °" not in vessel_shape(anatomy_of(lines))
 
 
-def test_a_section_that_is_longer_than_wide_is_not_round():
-    line = straight((0, 0, 0), (0, 0, 1), 40)
-    lines = [(line, constant(line, 2.0), -1, 0)]
-    round_one = anatomy_of(lines)
-    assert vessel_shape(round_one)["non-circularity"][0] < 0.01
-    shift = 0.4
-    own = round_one.tree.branches[0].centerline
-    beside = [replace(own, points=own.points + np.array([sign * shift, 0.0, 0.0])) for sign in (1.0, -1.0)]
-    long_one = anatomy_of(lines, beside=[beside])
-    # Circles of radius r about ±s: ρ(θ) = s·|cos θ| + √(r² − s²·sin²θ).
-    turn = 2 * np.pi * np.arange(32) / 32
-    reach = shift * np.abs(np.cos(turn)) + np.sqrt(4.0 - (shift * np.sin(turn)) ** 2)
-    assert vessel_shape(long_one)["non-circularity"][0] == pytest.approx(reach.std() / reach.mean(), abs=0.006)
-
-
-@pytest.mark.parametrize("angle", [0.0, 35.0, 70.0])
-def test_a_catheter_has_its_angle_to_the_vessel(angle):
-    line = straight((0, 0, 0), (0, 0, 1), 40)
-    direction = (np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle)))
-    anatomy = anatomy_of([(line, constant(line, 2.0), -1, 0)], direction=direction)
-    assert vessel_shape(anatomy)["catheter against vessel at 10 mm, °"] == pytest.approx([angle], abs=0.01)
-
-
 def test_the_distance_is_a_shift_in_standard_deviations():
     generator = np.random.default_rng(0)
     one = generator.normal(size=4000)
@@ -179,11 +145,3 @@ def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):
     assert by_name["LAD–LCx angle, °"]["given_count"] == 2
     with pytest.raises(InputError, match="is no anatomy and holds none"):
         compare_with_atlas([tmp_path / "none"], config)
-
-
-def test_a_tree_of_another_kind_is_refused(tmp_path):
-    line = straight((0, 0, 0), (0, 0, 1), 40)
-    anatomy = anatomy_of([(line, constant(line, 2.0), -1, 0)], names=("G0", "vessel"))
-    write_anatomy(anatomy, output=tmp_path / "generic")
-    with pytest.raises(InputError, match="sections are not those"):
-        compare_with_atlas([tmp_path / "generic"], AtlasConfig())

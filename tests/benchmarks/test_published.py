@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from benchmarks.__main__ import main
 from benchmarks.published import published, tubing
 from benchmarks.published.published import (
     Comparison,
     PublishedConfig,
     bending,
     tip_loads,
-    unreinforced,
 )
 from benchmarks.published.three_point import flexural_modulus
-from benchmarks.published.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
+from benchmarks.published.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.simulation.config import PRESETS
@@ -99,46 +95,3 @@ def test_what_calibrates_a_device_is_no_prediction() -> None:
     assert all(
         abs(modulus / nominal - 1) < 4.2 * published.DIAMETER_TOLERANCE_MM / 0.89 + 5e-3 for modulus in bent.ours
     )
-
-
-def test_an_unreinforced_catheter_is_plain_polymer_throughout() -> None:
-    catheter = read_catheter("microcatheter-2.4f")
-    plain = unreinforced(catheter)
-    section = np.pi * (0.8**4 - 0.53**4) / 64
-    np.testing.assert_allclose(plain.bend_stiffness(np.array([0.0, 50.0, 1000.0])), 100.0 * section)
-    assert plain.bend_stiffness_n_mm2[0] == pytest.approx(catheter.bend_stiffness_n_mm2[0], rel=1e-3)
-
-
-def test_the_command_shows_every_test_and_counts_what_failed(monkeypatch, capsys) -> None:
-    pushes = iter(range(10**6))
-
-    def push(anatomy, wire, catheters) -> Push:
-        seen.append((wire.friction, [each.friction for each in catheters]))
-        return Push(force_n=0.05 + 0.01 * len(catheters), through=next(pushes) != 0, valid=True)
-
-    seen: list[tuple[float, list[float]]] = []
-    monkeypatch.setattr(published, "push_through", push)
-    paths: list[dict] = []
-
-    def draw(random, **given) -> SimpleNamespace:
-        paths.append(given)
-        return SimpleNamespace(anatomy=lambda: None)
-
-    monkeypatch.setattr(published, "draw_tubing", draw)
-    monkeypatch.setattr(published, "straightenings", lambda config: [])
-    with pytest.raises(SystemExit) as left:
-        main(["published", "--draws", "2", "--seed", "4", "--json"])
-    assert not left.value.code
-    rows = {row["case"]: row for row in json.loads(capsys.readouterr().out)}
-    pushed = {name.rsplit(": ", 1)[1]: row for name, row in rows.items() if "pushed" in name}
-    assert pushed["workhorse-014"]["note"] == "1 did not pass" and pushed["stiff-014"]["note"] == ""
-    assert pushed["workhorse-014"]["verdict"] == "agrees" and pushed["stiff-014"]["share_within"] == 1
-    assert pushed["microcatheter-2.4f over stiff-014"]["verdict"] == "disagrees"
-    assert pushed["microcatheter-2.4f without reinforcement over workhorse-014"]["verdict"] is None
-    assert [row["verdict"] for name, row in rows.items() if "tip load" in name] == [None] * 3
-    assert paths == 2 * [{}, {"radius_mm": (12.0, 20.0)}, {"angle_share": 0.5}]
-    smooth = [(wall, coated) for wall, coated in seen if wall == 0]
-    assert len(smooth) == 4 and all(set(coated) <= {0.0} for _, coated in smooth)
-    seen = [each for each in seen if each not in smooth]
-    assert len({wall for wall, _ in seen}) == 2  # friction is drawn once a path, and every device sees the same
-    assert all(0.04 <= wall <= 0.15 and all(0.03 <= mu <= 0.1 for mu in coated) for wall, coated in seen)

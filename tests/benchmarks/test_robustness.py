@@ -20,9 +20,6 @@ from endopilot.devices.device_files import list_wires
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.simulate import simulate
-from endopilot.types import Centerline
 
 DEVICE = read_wire("workhorse-014")
 
@@ -96,59 +93,12 @@ def test_wire_and_catheter_have_manoeuvres_of_their_own_and_go_in_again(patient)
     assert (ahead.any(axis=1) & ~ahead.all(axis=1)).sum() > 8  # their ends cross
 
 
-def test_pairs_are_random_and_fit_into_each_other() -> None:
-    drawn = [stacks_of(index, seed=1, catheters=True) for index in range(6)]
-    names = [[tuple(device.name for device in stack.devices) for stack in stacks] for stacks in drawn]
-    assert all(len(set(pairs)) == 5 for pairs in names) and len({tuple(pairs) for pairs in names}) == 6
-    for stack in (stack for stacks in drawn for stack in stacks):
-        assert stack.wire.diameter_mm < stack.catheters[0].inner_diameter_mm
-    again = stacks_of(3, seed=1, catheters=True)
-    assert [stack.devices for stack in again] == [stack.devices for stack in drawn[3]]
-
-
 def test_pairs_are_driven_and_told_by_name(tmp_path: Path, in_this_process) -> None:
     config = replace(small(tmp_path / "run"), rollouts=5, seconds=5.0, catheters=True)
     measured = measure_robustness(config)
     assert measured["rollouts"] + len(measured["did_not_fit"]) == 5 and measured["invalid"] == 0
     pairs = {" in ".join(device.name for device in stack.devices) for stack in stacks_of(0, seed=3, catheters=True)}
     assert set(measured["by_device"]) <= pairs and measured["largest_push_n"] > 0
-
-
-def test_non_finite_numbers_in_valid_worlds_are_counted(patient) -> None:
-    initial, control = robust_controls(patient, DEVICE, rollouts=2, samples=2, seed=0)
-    rollout = simulate(patient, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
-    torque = rollout.base_torque.copy()
-    torque[:, 1] = np.nan
-    valid = rollout.valid.copy()
-    valid[0, 1] = False
-    config = SimulatorConfig(wall_stiffness_n_mm=5.0)
-    chunk = robustness._describe(patient, Stack(DEVICE), replace(rollout, base_torque=torque, valid=valid), config, 0.0)
-    assert chunk.non_finite.tolist() == [0, 1]
-    np.testing.assert_allclose(chunk.penetration_mm, rollout.contact_force_max / 5.0, rtol=1e-6)
-
-
-def test_a_device_wider_than_a_lumen_that_it_has_passed_is_wedged(patient) -> None:
-    catheter = read_catheter("microcatheter-2.4f")
-    stack = Stack(DEVICE, (catheter,))
-    initial, control = np.array([[[20.0, 0.0], [5.0, 0.0]]]), np.zeros((1, 40, 2, 2))
-    control[0, :, 1, 0] = 2.0  # the catheter goes in, over the wire and beyond
-    rollout = simulate(patient, stack, control, initial=initial)
-    alone = simulate(patient, DEVICE, control[:, :, 0], initial=initial[:, 0])
-    path = patient.tree.path(int(rollout.tip.branch[0, -1, 0]))
-    behind = np.flatnonzero(path.abscissa < 15)
-    tree = patient.tree
-    at = path.abscissa[behind[-1]]
-
-    def narrowed(line: Centerline) -> Centerline:
-        return replace(line, radius=np.where(np.abs(line.abscissa - at) < 0.5, 0.3, line.radius))
-
-    narrow = tuple(replace(branch, centerline=narrowed(branch.centerline)) for branch in tree.branches)
-    stenosed = replace(patient, tree=replace(tree, branches=narrow))
-    inserted = rollout.inserted_length[0, :, 1]
-    wedged = robustness._wedged(stenosed, stack, rollout)[0]  # 0.3 mm: wider than the wire, narrower than the catheter
-    assert not wedged[inserted < 12].any() and wedged[inserted > 20].all() and (inserted > 20).any()
-    assert not robustness._wedged(stenosed, Stack(DEVICE), alone).any()
-    assert not robustness._wedged(patient, stack, rollout).any()
 
 
 class Fatal(Wire):

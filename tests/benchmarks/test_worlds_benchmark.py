@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.agent import worlds
 from benchmarks.agent.drawn_worlds import KINDS, drawn_world
-from benchmarks.agent.worlds import DrivenAtRandom, counted, drive_in_worlds, driven_on, figures, identified, row
+from benchmarks.agent.worlds import DrivenAtRandom, counted, driven_on, figures, identified, row
 from endopilot.belief.identification import Identified
-from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.record import count_navigation_events
 from endopilot.simulation.config import SimulatorConfig
@@ -170,39 +167,3 @@ def test_patients_are_those_of_no_task_and_of_one_set():
         assert sum(len(numbers) for _, numbers in chosen.values()) == worlds.PLACES
         assert list(chosen) == [task.name for task in list_tasks() if task.vessel in ("rca", "lca")]
     assert worlds.navigation_at("test", 7)[2] == 1000 * 20002 + 1
-
-
-def write_good(path: Path, worlds: object, patients: object) -> None:
-    path.write_text(json.dumps(GOOD | {"by": path.parent.name}))
-
-
-def test_a_run_goes_on_and_prints_the_figures_with_their_bars(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(worlds, "measure", write_good)
-
-    def make_here(title, paths, make):
-        made.append([path for path in paths if not path.exists()])
-        for path in made[-1]:
-            path.parent.mkdir(exist_ok=True, parents=True)
-            make(path)
-
-    monkeypatch.setattr(worlds, "make_missing", make_here)
-    own = tmp_path / "own.yaml"
-    own.write_text("about: a wide vessel\nlumen_factor: 1.2\n")
-    out = tmp_path / "out"
-    chosen = ("nominal", str(own))
-    first = drive_in_worlds(output=out, planned=2, random=1, worlds=chosen)
-    assert [path.relative_to(out).parts[:2] for path in made[0]] == [
-        ("nominal", "planned"),
-        ("nominal", "random"),
-        ("own", "planned"),
-        ("own", "random"),
-        ("nominal", "planned"),
-        ("own", "planned"),
-    ]  # in turns
-    assert len(first["worlds"]) == 4 and first["passed"]["missed_share"] is False and first["passed"]["safe_share"]
-    drive_in_worlds(output=out, planned=3, random=1, worlds=chosen)
-    assert len(made[1]) == 2
-    own.write_text("lumen_factor: 1.3\n")
-    with pytest.raises(InputError, match=r"was begun with world\.lumen_factor"):
-        drive_in_worlds(output=out, planned=2, random=1, worlds=chosen)

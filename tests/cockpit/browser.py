@@ -1,4 +1,4 @@
-"""A server in a process of its own, and a browser, for tests."""
+"""A server in a process of its own, a browser, and films that are driven, for tests."""
 
 from __future__ import annotations
 
@@ -51,6 +51,17 @@ def serving(*arguments):
         yield server
     finally:
         server.stop()
+
+
+def shown(film, *, start=True):
+    """Return a film that was driven to its end."""
+    if start:
+        film.start()
+    end = time.monotonic() + 60
+    while not film.done and time.monotonic() < end:
+        time.sleep(0.01)
+    assert film.done and not film.failure, film.failure
+    return film
 
 
 def value(page, script):

@@ -90,23 +90,6 @@ def test_a_gamepad_drives_turns_and_exposes(context, server):
     until(page, "cockpit.shown.velocity[0] === 0 && cockpit.shown.velocity[1] === 0 && !cockpit.shown.xray.on")
 
 
-def test_two_pages_watch_and_one_drives(context, server):
-    first, second = opened(context, server), opened(context, server)
-    until(second, "cockpit.role.taken && !cockpit.role.drives")
-    first.bring_to_front()
-    began = value(second, "cockpit.state.inserted_length_mm")
-    second.evaluate("() => cockpit.connection.send('drive', {translation: 5, rotation: 0})")
-    until(second, "document.getElementById('banner').textContent.includes('watches')")
-    assert value(second, "cockpit.state.inserted_length_mm") == pytest.approx(began, abs=0.01)
-    first.click("#wheel")
-    until(second, "!document.getElementById('wheel').hidden && !cockpit.role.taken")
-    second.bring_to_front()
-    second.click("#wheel")
-    until(second, "cockpit.role.drives")
-    hold(second, "KeyW", f"cockpit.state.inserted_length_mm > {began + 2}", watcher=first)
-    second.keyboard.up("KeyW")
-
-
 def test_a_policy_drives_and_a_hand_takes_over(context, server):
     page = opened(context, server)
     page.select_option("#autopilot-policy", "forward")

@@ -8,17 +8,17 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from browser import shown
 from test_game import Rival, play
 from test_session import run
 
 from endopilot.cockpit import game
 from endopilot.cockpit.film import open_film
-from endopilot.cockpit.frames import decode, scene
 from endopilot.cockpit.game import Attempt, GameSession
 from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal, Target
 from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import read_session, replayed
-from endopilot.cockpit.session import SILENCE_S, Session
+from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import LiveWorld
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
@@ -74,14 +74,6 @@ def test_the_wall_presses_on_the_outermost_device_alone(world, wire_mm, catheter
     np.testing.assert_array_equal(snapshot.catheters[0].node_force, 1.0)
 
 
-def test_silence_stops_both(session):
-    session.handle(both((5.0, 1.0), (4.0, 1.0)), 0.0)
-    run(session, SILENCE_S)
-    assert session.world.loop.robot.velocity.tolist() == [[5.0, 1.0], [4.0, 1.0]]
-    (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
-    assert header["stopped"] == "silence" and header["velocity"] == [0.0] * 4
-
-
 def test_more_catheters_than_there_are_are_refused(session):
     with pytest.raises(InputError, match=r"^catheters: 2; this wire has 1 around it$"):
         session.handle(Drive(type="drive", translation=1.0, rotation=0.0, catheters=((1.0, 0.0), (1.0, 0.0))), 0.0)
@@ -92,21 +84,13 @@ def test_x_ray_shows_the_catheters_marker(session):
     session.xray.settings = replace(session.xray.settings, dose=10.0)
     _, images = run(session, 0.3, message=Pedal(type="pedal", down=True), start=1.0)
     snapshot, unit = session.world.snapshot(), session.xray
-    plane = unit._planes[unit.settings.planes[0]]
+    plane = unit.plane(unit.settings.planes[0])
     grey = images[-1][1]["grey"].astype(float)
-    imager = unit._imager
+    imager = unit.imager
     marker = imager.wire(plane, snapshot.catheters[0].nodes, number=1) > 0.2
     wire = imager.wire(plane, snapshot.nodes) > 0.6
     assert 2 < marker.sum() < 40
     assert grey[marker & wire].mean() < grey[wire & ~marker].mean() - 5
-
-
-def test_the_scene_names_the_catheter(navigation):
-    header, _ = decode(scene(navigation, {}))
-    (shown,) = header["catheters"]
-    assert (shown["name"], shown["diameter_mm"]) == (NAME, 0.57)
-    alone, _ = decode(scene(replace(navigation, catheters=()), {}))
-    assert "catheters" not in alone
 
 
 def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
@@ -115,16 +99,12 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
         (header, arrays), _ = run(session, 0.8, message=both(wire, catheter))
         seen[header["cycle"]] = arrays["nodes"], arrays["catheter_1_nodes"]
     session.close()
-    film = open_film(path)
-    film.start()
-    until = time.monotonic() + 60
-    while not film.done and time.monotonic() < until:
-        time.sleep(0.01)
-    shown = {frame.snapshot.cycle: frame.snapshot for frame in film.frames}
-    assert not film.failure and film.navigation.catheters[0].name == NAME
+    film = shown(open_film(path))
+    frames = {frame.snapshot.cycle: frame.snapshot for frame in film.frames}
+    assert film.navigation.catheters[0].name == NAME
     for cycle, (wire, catheter) in seen.items():
-        np.testing.assert_array_equal(shown[cycle].nodes.astype("<f4"), wire)
-        np.testing.assert_array_equal(shown[cycle].catheters[0].nodes.astype("<f4"), catheter)
+        np.testing.assert_array_equal(frames[cycle].nodes.astype("<f4"), wire)
+        np.testing.assert_array_equal(frames[cycle].catheters[0].nodes.astype("<f4"), catheter)
     with path.open("a") as stream:
         stream.write('{"at": 199, "mo')  # what a killed server may leave
     resumed = resume_session(path).stage
@@ -232,10 +212,8 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
         config=config,
     )
     rollout.write(tmp_path / "r.npz")
-    film = open_film(tmp_path / "r.npz", vessel)
-    film._drive()
+    film = shown(open_film(tmp_path / "r.npz", vessel))
     last = film.frames[-1].snapshot
-    assert not film.failure
     assert last.inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 0], abs=1e-9)
     assert last.catheters[0].inserted_length_mm == pytest.approx(rollout.inserted_length[0, -1, 1], abs=1e-9)
     np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.tip_position[0, -1, 1], atol=0.02)
@@ -251,15 +229,13 @@ def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
 
     folder, config = tmp_path / "navigation", NavigateConfig(seconds=2.0)
     navigate_into(vessel, "0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
-    film = open_film(tmp_path / "navigation", vessel)
-    film._drive()
-    assert not film.failure
+    film = shown(open_film(tmp_path / "navigation", vessel))
     last = film.frames[-1].snapshot
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)
     assert last.inserted_length_mm == table["inserted_length_mm"][-1]
     assert last.catheters[0].inserted_length_mm == table["catheter_1_inserted_length_mm"][-1]
-    shown = [frame.snapshot.time_s for frame in film.frames if frame.exposed]
-    assert shown == table["time_s"][table["xray"] == 1].tolist()
+    exposed = [frame.snapshot.time_s for frame in film.frames if frame.exposed]
+    assert exposed == table["time_s"][table["xray"] == 1].tolist()
     assert film.navigation.target.abscissa == pytest.approx(15.0, abs=1.0)
 
 
@@ -273,9 +249,7 @@ def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
     config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0, seed=1)
     generate_dataset([vessel], output=tmp_path / "data", device=navigation.stack, config=config)
     data = read_dataset(tmp_path / "data")
-    film = open_film(tmp_path / "data")
-    film._drive()
-    assert not film.failure
+    film = shown(open_film(tmp_path / "data"))
     last = film.frames[-1].snapshot
     np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1, 0], atol=1e-4)
     np.testing.assert_allclose(last.catheters[0].nodes[0], data.tip_position[0, -1, 1], atol=1e-4)
@@ -288,9 +262,8 @@ def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
 
     made = plan(vessel, "0,0,9", config=PlanConfig(seconds=20.0, tip="own"), device=Stack.of("workhorse-014", NAME))
     write_plan(made, output=tmp_path / "plan")
-    film = open_film(tmp_path / "plan", vessel)
-    film._drive()
+    film = shown(open_film(tmp_path / "plan", vessel))
     last = film.frames[-1].snapshot
-    assert not film.failure and film.navigation.catheters[0].name == NAME
+    assert film.navigation.catheters[0].name == NAME
     np.testing.assert_allclose(last.nodes[0], made.trajectory.tip_position[0, -1, 0], atol=0.05)
     np.testing.assert_allclose(last.catheters[0].nodes[0], made.trajectory.tip_position[0, -1, 1], atol=0.05)

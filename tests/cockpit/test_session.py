@@ -84,9 +84,9 @@ def test_x_ray_shows_the_wire_and_contrast_the_vessel(session):
     _, plain = run(session, 0.3, message=Pedal(type="pedal", down=True), start=0.6)
     session.handle(Contrast(type="contrast"), 1.0)
     _, lit = run(session, 0.6, message=Pedal(type="pedal", down=True), start=1.0)
-    plane = session.xray._planes[session.xray.settings.planes[0]]
+    plane = session.xray.plane(session.xray.settings.planes[0])
     vessel = plane.vessel_mm > 1.0
-    wire = session.xray._imager.wire(plane, session.world.snapshot().nodes) > 0.4
+    wire = session.xray.imager.wire(plane, session.world.snapshot().nodes) > 0.4
     grey = plain[-1][1]["grey"].astype(float)
     assert vessel.sum() > 100 and wire.sum() > 10
     assert grey[wire].mean() < grey[~wire & ~vessel].mean() - 20

@@ -12,7 +12,6 @@ from importlib import import_module
 from pathlib import Path
 
 import navigations
-import numpy as np
 import pytest
 
 BASELINE = import_module("endopilot._core_baseline")
@@ -40,16 +39,6 @@ def test_every_level_and_every_number_of_lanes_gives_the_same_bits() -> None:
         for name, digest in answer["digests"].items():
             found[name.split(",")[0]].add(digest)
     assert {actuation: len(digests) for actuation, digests in found.items()} == {"velocity": 1, "force": 1}
-
-
-@pytest.mark.parametrize("lanes", [4, 8])
-def test_a_wire_driven_by_force_does_not_depend_on_the_wires_beside_it(lanes: int) -> None:
-    # without a wall the drive makes the longest move of a Newton step, which all moves are scaled by
-    together = navigations.navigate("force", lanes, walled=False)
-    for world in range(navigations.WORLDS):
-        alone = navigations.navigate("force", lanes, worlds=slice(world, world + 1), walled=False)
-        for name in ("tip_position", "inserted_length", "rotation", "base_force", "iterations"):
-            assert np.array_equal(alone[name][0], together[name][world]), f"{name} of world {world}"
 
 
 def test_the_highest_level_that_the_processor_supports_is_taken() -> None:

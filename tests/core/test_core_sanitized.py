@@ -42,17 +42,3 @@ def test_the_core_passes_its_tests_under_sanitizers(compiler: str, name: str, tm
     ran = subprocess.run([program], capture_output=True, encoding="utf-8")
     assert ran.returncode == 0, f"{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}"
     assert "all core tests passed" in ran.stdout
-
-
-def test_the_sanitizers_end_a_faulty_program(compiler: str, tmp_path: Path) -> None:
-    faults = {
-        "heap-buffer-overflow": "std::vector<double> v(4); volatile int i = 4; return int(v.data()[i]);",
-        "signed integer overflow": "volatile int i = 2147483647; volatile int j = i + 1; return j > 0;",
-    }
-    for report, body in faults.items():
-        source = tmp_path / "faulty.cpp"
-        source.write_text(f"#include <vector>\nint main() {{ {body} }}\n")
-        program = tmp_path / "faulty"
-        subprocess.run([compiler, *FLAGS, source, "-o", program], check=True, capture_output=True)
-        ran = subprocess.run([program], capture_output=True, encoding="utf-8")
-        assert ran.returncode != 0 and report in ran.stderr

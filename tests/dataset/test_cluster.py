@@ -13,6 +13,7 @@ from test_generate import data_hashes
 
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
+from endopilot.dataset.workers import run_on_cluster
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -62,16 +63,16 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_dies(tmp_path, monkeypatc
             client.wait_for_workers(2, timeout=120)
         killed = []
 
-        def kill_one(ledger, block, seconds):
-            if not killed:
-                processes[1].kill()
-                killed.append(block)
-            add(ledger, block, seconds)
+        def kill_one(work, items, done, scheduler):
+            def killing(block, seconds):
+                if not killed:
+                    processes[1].kill()
+                    killed.append(block)
+                done(block, seconds)
 
-        from endopilot.dataset.generate import _Ledger
+            run_on_cluster(work, items, killing, scheduler)
 
-        add = _Ledger.add
-        monkeypatch.setattr(_Ledger, "add", kill_one)
+        monkeypatch.setattr("endopilot.dataset.generate.run_on_cluster", kill_one)
         config = DatasetConfig(anatomy_shares=(2 / 3, 0.0, 1 / 3), **SETTINGS)
         folders = write_toy_anatomies(tmp_path / "anatomies", 3)
         generate_dataset(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import signal
@@ -22,7 +21,6 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset import layout
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import read_dataset
-from endopilot.devices.device_files import device_yaml
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
 from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
@@ -55,13 +53,6 @@ def test_pandas_reads_the_layout_of_lerobot(toy_dataset):
     assert tasks.loc[last["tasks"][0], "task_index"] == samples["task_index"].iloc[0]
 
 
-def test_motion_is_the_integral_of_the_control(toy_dataset):
-    data = read_dataset(toy_dataset)
-    travel = data.sample_period_s * np.cumsum(data.control.astype(float), axis=1)
-    np.testing.assert_allclose(data.inserted_length, data.initial[:, None, :, 0] + travel[..., 0], atol=1e-5)
-    np.testing.assert_allclose(data.rotation, data.initial[:, None, :, 1] + travel[..., 1], atol=1e-5)
-
-
 def test_statistics_are_those_of_the_samples(toy_dataset):
     data, stats = read_dataset(toy_dataset), read_json(toy_dataset / "meta/stats.json")
     flat = data.control.reshape(-1, 2).astype(float)
@@ -71,35 +62,12 @@ def test_statistics_are_those_of_the_samples(toy_dataset):
     assert stats["action"]["count"] == [144 * 120]
 
 
-def test_no_anatomy_of_test_is_trained_on(toy_dataset):
-    data = read_dataset(toy_dataset)
-    assert not set(data.of_split("train").anatomy) & set(data.of_split("test").anatomy)
-    assert set(data.of_split("seen_test").anatomy) == set(data.of_split("train").anatomy)
-    pairs = {(a, s) for split in ("train", "seen_test") for a, s in _keys(data.of_split(split))}
-    assert len(pairs) == len(data.of_split("train")) + len(data.of_split("seen_test"))
-
-
-def test_no_anatomy_is_in_two_of_the_three_splits_that_are_stored(tmp_path):
-    make_toy_dataset(tmp_path / "d", patients=10, sequences=3, anatomy_shares=None, seconds=5.0)
-    episodes = pd.concat(pd.read_parquet(p) for p in sorted((tmp_path / "d/meta/episodes").glob("*/*.parquet")))
-    by_anatomy = episodes.groupby("anatomy")["split"].agg(lambda splits: "+".join(sorted(set(splits))))
-    assert by_anatomy.value_counts().to_dict() == {"seen_test+train": 6, "calibrate": 2, "test": 2}
-    ranked = sorted(by_anatomy.index, key=lambda name: hashlib.sha256(name.encode()).digest())
-    assert by_anatomy[ranked].tolist() == ["seen_test+train"] * 6 + ["calibrate"] * 2 + ["test"] * 2
-
-
 def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_dataset):
     make_toy_dataset(tmp_path / "small-files", patients=6, sequences=24, sequences_per_file=7)
     whole, split = read_dataset(toy_dataset), read_dataset(tmp_path / "small-files")
     assert split.manifest["files"] == 6 * 4
     for name in ("control", "tip_abscissa", "friction", "initial", "split", "anatomy"):
         assert (getattr(whole, name) == getattr(split, name)).all(), name
-
-
-def test_friction_is_drawn_from_its_range(tmp_path):
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=40, friction=(0.05, 0.2), seconds=2.0)
-    friction = read_dataset(tmp_path / "d").friction
-    assert 0.05 <= friction.min() < 0.08 < 0.17 < friction.max() <= 0.2
 
 
 def test_killed_and_resumed_gives_the_same_bits(tmp_path):
@@ -262,10 +230,6 @@ def test_bad_settings_are_named(field, value):
         DatasetConfig(**{field: value})
 
 
-def _keys(data):
-    return zip(data.anatomy.tolist(), data.sequence.tolist(), strict=True)
-
-
 def test_loader_names_what_is_damaged(tmp_path):
     with pytest.raises(InputError, match="no dataset here"):
         read_dataset(tmp_path)
@@ -274,9 +238,6 @@ def test_loader_names_what_is_damaged(tmp_path):
     file = tmp_path / "d/data/chunk-000/file-001.parquet"
     whole = file.read_bytes()
 
-    file.write_bytes(whole[:-40])
-    with pytest.raises(InputError, match=r"file-001\.parquet: damaged"):
-        read_dataset(tmp_path / "d")
     file.write_bytes((tmp_path / "other/data/chunk-000/file-001.parquet").read_bytes())
     with pytest.raises(InputError, match=r"file-001\.parquet: written by another version or with other settings"):
         read_dataset(tmp_path / "d")
@@ -298,20 +259,6 @@ def test_loader_names_what_is_damaged(tmp_path):
         (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {name: odd}))
         with pytest.raises(InputError, match="; make the dataset again"):
             read_dataset(tmp_path / "d")
-    (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest))
-    (tmp_path / "d/meta/info.json").unlink()
-    with pytest.raises(InputError, match=r"info\.json: missing from the dataset"):
-        read_dataset(tmp_path / "d")
-
-
-def test_a_changed_device_of_the_same_name_is_refused(tmp_path):
-    file = tmp_path / "wire.yaml"
-    text = device_yaml("workhorse-014")[1]
-    file.write_text(text)
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, device=str(file))
-    file.write_text(text.replace("value: 0.36", "value: 0.35", 1))
-    with pytest.raises(InputError, match=r"was begun with device\.diameter_mm = 0\.36, now it is 0\.35"):
-        make_toy_dataset(tmp_path / "d", patients=1, sequences=4, device=str(file))
 
 
 def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):

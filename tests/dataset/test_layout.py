@@ -74,11 +74,6 @@ def test_one_patient_is_split_by_sequence():
     assert sorted(splits[0].tolist()) == ["seen_test"] * 2 + ["train"] * 8
 
 
-def test_every_requested_split_gets_an_anatomy():
-    splits = assign_splits(NAMES[:3], 5)
-    assert {"train", "calibrate", "test"} <= set(splits.ravel().tolist())
-
-
 def test_too_few_anatomies_are_refused_with_advice():
     with pytest.raises(InputError, match=r"2 anatomies cannot fill 3 splits.*at least 3"):
         assign_splits(NAMES[:2], 5)
@@ -163,16 +158,17 @@ def test_figures_are_those_of_the_samples(folder):
     assert figures["hours"] == 0.5
     assert figures["splits"] == {name: int((data.split == name).sum()) for name in set(data.split.tolist())}
     valid = data.valid
-    for name, values, step in (
-        ("inserted length Δ mm", data.inserted_length, 0.25),
-        ("offset ratio γ/r", data.tip_offset / data.lumen_radius, 0.003),
-        ("offset ratio γ/(r − r_w)", data.tip_offset / (data.lumen_radius - 0.18), 0.003),
-        ("largest contact force N", data.contact_force_max, 0.002),
+    for name, values in (
+        ("inserted length Δ mm", data.inserted_length),
+        ("offset ratio γ/r", data.tip_offset / data.lumen_radius),
+        ("offset ratio γ/(r − r_w)", data.tip_offset / (data.lumen_radius - 0.18)),
+        ("largest contact force N", data.contact_force_max),
     ):
         for quantile, share in (("p5", 5), ("median", 50), ("p95", 95)):
-            expected = np.percentile(np.clip(values[valid], 0, None if "ratio" not in name else 1.2), share)
-            assert figures[name][quantile] == pytest.approx(expected, abs=step), (name, quantile)
+            assert figures[name][quantile] == pytest.approx(np.percentile(values[valid], share), abs=2e-5), name
     assert figures["branches visited"] == {"1": 1.0}
+    assert figures["invalid"] == 6  # the second navigation of each of six files
+    assert figures["invalid_reasons"] == {"did not converge": 6}
 
 
 def test_manoeuvres_are_those_that_were_driven(folder):
@@ -185,12 +181,6 @@ def test_manoeuvres_are_those_that_were_driven(folder):
     assert shares["pause"] == pytest.approx((still & (np.abs(velocity[:, 1]) <= 0.02)).mean(), abs=1e-4)
     assert min(shares.values()) > 0
     assert sum(shares.values()) == pytest.approx(1, abs=3e-4)
-
-
-def test_failures_are_counted_with_their_reason(folder):
-    figures = describe_dataset(folder).figures
-    assert figures["invalid"] == 6  # the second navigation of each of six files
-    assert figures["invalid_reasons"] == {"did not converge": 6}
 
 
 def test_every_distribution_has_a_picture(folder, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.generate import generate_dataset, write_episode
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import read_dataset
 from endopilot.dataset.navigations import (
     PULL_BACK_MM,
@@ -26,8 +26,6 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.evaluation.protocols import Recorded
 from endopilot.models.config import WINDOW
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
 DEVICE = read_wire("workhorse-014")
@@ -44,19 +42,9 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
     assert np.ptp(data.tip_abscissa, axis=1).max() > 1
     tips = list(zip(data.tip_bend.tolist(), data.tip_stiffness_factor.tolist(), strict=True))
     assert [tip == tips[0] for tip in tips] == [True] * TIP_GROUP + [False] * 2
-    for tip in set(tips):
-        one = data[np.array([other == tip for other in tips])]
-        again = simulate(
-            read_anatomy(data.anatomy_folder(str(data.anatomy[0]))),
-            DEVICE.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]),
-            one.control.astype(float),
-            initial=one.initial,
-            config=config.simulator,
-            friction=one.friction,
-        )
-        np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
-        np.testing.assert_array_equal(again.contact_force_sum.astype(np.float32), one.contact_force_sum)
-        np.testing.assert_array_equal(again.drive_force.astype(np.float32), one.drive_force)
+    again = data.driven()
+    for name in ("contact_force_sum", "drive_force", "tip_position"):
+        np.testing.assert_array_equal(getattr(again, name).astype(np.float32), getattr(data, name))
 
 
 def test_a_robot_makes_the_motions_and_what_it_was_told_and_measured_stands_beside_what_was_true(tmp_path, patient):
@@ -78,14 +66,7 @@ def test_a_robot_makes_the_motions_and_what_it_was_told_and_measured_stands_besi
     noise = data.load[..., 0, 0] - data.drive_force[..., 0]
     assert noise.std() == pytest.approx(play.load_sd_n, rel=0.2)
     # what the drives made of it repeats the navigation
-    again = simulate(
-        read_anatomy(patient),
-        data.stack,
-        data.command,
-        initial=data.initial,
-        config=SimulatorConfig(**data.manifest["config"]["simulator"]),
-        friction=data.friction,
-    )
+    again = data.driven()
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
     np.testing.assert_array_equal(again.inserted_length.astype(np.float32), data.inserted_length)
     # a navigation's robot does not depend on the others
@@ -153,16 +134,7 @@ def test_a_dataset_driven_by_force(tmp_path, patient):
     travel = 0.5 * np.cumsum(one.control.astype(float), axis=1)
     np.testing.assert_allclose(one.inserted_length, one.initial[:, None, :, 0] + travel[..., 0], atol=1e-4)
     assert np.ptp(data.inserted_length, axis=1).max() > 5
-    again = simulate(
-        read_anatomy(patient),
-        DEVICE,
-        load[None],
-        actuation="force",
-        initial=one.initial,
-        config=config.simulator,
-        friction=one.friction,
-    )
-    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
+    np.testing.assert_array_equal(one.driven().tip.abscissa.astype(np.float32), one.tip_abscissa)
     assert sum(data.manifest["manoeuvres"].values()) == pytest.approx(1)
 
 
@@ -183,23 +155,3 @@ def test_vessels_move_as_it_is_drawn_for_each_patient(tmp_path, patient):
     recorded = Recorded.of(data)
     ((_, again),) = recorded.simulated({"true_replay": data.command[:, WINDOW:, 0]})
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
-
-
-def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_path, patient):
-    motion, simulator = motion_named("heartbeat", 7), DatasetConfig().simulator
-    drawn = draw_navigations(DatasetConfig(sequences=1, seconds=16.0), DEVICE, read_anatomy(patient), range(1))
-    options = {"initial": drawn.initial, "config": simulator, "motion": motion}
-    trajectory = simulate(read_anatomy(patient), DEVICE, drawn.control, **options)
-    assert (drawn.control != drawn.control.astype(np.float32)).any()
-    told = {"task": "navigate", "seed": 7, "origin": {}, "tip_stiffness_factor": 1.0}
-    write_episode(trajectory, patient, tmp_path / "episode", Stack(DEVICE), **told)
-    data = read_dataset(tmp_path / "episode")
-    assert data.motion(str(data.anatomy[0])) == motion
-    ((_, again),) = Recorded.of(data).simulated({"true_replay": data.command[:, WINDOW:, 0]})
-    for name in ("tip_position", "tip_direction", "drive_force", "drive_torque", "contact_force_sum"):
-        np.testing.assert_array_equal(getattr(again, name).astype(np.float32), getattr(data, name), err_msg=name)
-    np.testing.assert_array_equal(again.slip, data.slip)
-    np.testing.assert_array_equal(again.command, trajectory.command)
-    still = replace(trajectory, set_up=replace(trajectory.set_up, motion=None))
-    write_episode(still, patient, tmp_path / "still", Stack(DEVICE), **told)
-    assert read_dataset(tmp_path / "still").motion(str(data.anatomy[0])) is None

@@ -11,12 +11,14 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from env_checks import same
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.episodes import CONTROL_PERIOD_S, FORCE_REWARD, PROGRESS_REWARD, STEP_REWARD, SUCCESS_REWARD
+from endopilot.env.observation import RouteTables
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import NavigateVectorEnv, of_world
 from endopilot.errors import InputError
@@ -25,8 +27,9 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.targets import find_target
 from endopilot.tasks.task import in_catheter, reference_navigation
+from endopilot.types import TipProjection
 
-WORLDS, STEPS = 3, 12
+WORLDS = 3
 
 
 @pytest.fixture(scope="module")
@@ -41,21 +44,6 @@ def near() -> Navigation:
 def either(near, request) -> Navigation:
     """Return that navigation of a wire alone, and of a microcatheter over the wire."""
     return near if request.param == "wire" else in_catheter([near], "microcatheter-1.7f")[0]
-
-
-def _actions(navigation: Navigation, steps: int = STEPS, worlds: int = WORLDS, seed: int = 0) -> np.ndarray:
-    shape = (steps, worlds, 2 * len(navigation.devices))
-    return np.random.default_rng(seed).uniform(-0.5, 1.0, shape).astype(np.float32)
-
-
-def _rollout(env: NavigateVectorEnv, actions: np.ndarray) -> list[np.ndarray]:
-    """Return observations, rewards and ends of all steps."""
-    steps = [env.step(row)[:4] for row in actions]
-    return [np.array(values) for values in zip(*steps, strict=True)]
-
-
-def _same(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @pytest.mark.parametrize("name", ["Navigate", "NavigateCoaxial"])
@@ -96,7 +84,7 @@ def test_importing_the_package_registers_the_environments_and_not_gymnasium(orde
 
 def test_episodes_end_when_the_registered_steps_are_over_and_not_before(near):
     env = gymnasium.make("endopilot/Navigate-v0")
-    assert env.spec.max_episode_steps == env.unwrapped._worlds.navigations[0].periods(CONTROL_PERIOD_S)
+    assert env.spec.max_episode_steps == reference_navigation().periods(CONTROL_PERIOD_S)
     long = replace(near, seconds=61.0)
     with pytest.raises(InputError, match="navigations: take up to 458 steps, and the registered environment 450"):
         gymnasium.make("endopilot/Navigate-v0", navigations=long)
@@ -156,13 +144,6 @@ def test_worlds_that_end_are_reset_in_the_same_step_where_that_is_asked_for(near
     assert ends == 3
 
 
-def same(one, other) -> bool:
-    """Return whether two observations are equal."""
-    if isinstance(one, dict):
-        return all(np.array_equal(one[name], other[name]) for name in one)
-    return np.array_equal(one, other)
-
-
 def test_an_anatomy_and_a_target_are_an_environment():
     anatomy = reference_navigation().anatomy
     one, many = NavigateEnv(anatomy, "2"), NavigateVectorEnv(2, anatomy, target="2", patients=1)
@@ -186,48 +167,11 @@ def test_a_vector_environment_is_made_by_its_name(near):
     assert {f"_{name}" for name in infos if not name.startswith("_")} == {n for n in infos if n.startswith("_")}
 
 
-def test_the_same_seed_and_actions_give_the_same_bits(either):
-    first = NavigateVectorEnv(WORLDS, navigations=either)
-    second = NavigateVectorEnv(WORLDS, navigations=either)
-    start, again = first.reset(seed=4)[0], second.reset(seed=4)[0]
-    assert np.array_equal(start, again)
-    assert not np.array_equal(start[0], start[1]), "worlds begin with rotations of their own"
-    assert _same(_rollout(first, _actions(either)), _rollout(second, _actions(either)))
-    assert not np.array_equal(start, first.reset(seed=5)[0])
-
-
 def test_a_world_that_is_given_no_seed_goes_on_with_its_generator(near):
     one, other = NavigateVectorEnv(2, navigations=near), NavigateVectorEnv(2, navigations=near)
     for env in (one, other):
         env.reset(seed=4)
     assert np.array_equal(one.reset(seed=[None, None])[0], other.reset()[0])
-
-
-def test_a_single_environment_is_one_world_of_the_vector_environment(either):
-    actions = _actions(either, steps=22)  # of 23
-    many = NavigateVectorEnv(WORLDS, navigations=either, autoreset_mode=AutoresetMode.DISABLED)
-    begun = many.reset(seed=7)[0]
-    steps = _rollout(many, actions)
-    for world in (0, 2):
-        one = NavigateEnv(navigations=either)
-        assert np.array_equal(one.reset(seed=7 + world)[0], begun[world])
-        for step, action in enumerate(actions[:, world]):
-            observation, reward, terminated, truncated, _ = one.step(action)
-            assert np.array_equal(observation, steps[0][step, world])
-            assert (reward, terminated, truncated) == tuple(values[step, world] for values in steps[1:])
-
-
-def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickle(either):
-    env = NavigateVectorEnv(WORLDS, navigations=either)
-    env.reset(seed=1)
-    _rollout(env, _actions(either, steps=5))
-    kept, stored = env.state, pickle.dumps(env)
-    actions = _actions(either, steps=40, seed=2)  # past the time limit, so that new rotations are drawn too
-    went = _rollout(env, actions)
-    assert went[3].any()
-    env.set_state(pickle.loads(pickle.dumps(kept)))
-    assert _same(_rollout(env, actions), went)
-    assert _same(_rollout(pickle.loads(stored), actions), went)
 
 
 def test_a_single_environment_can_be_pickled_and_restored(either):
@@ -245,6 +189,16 @@ def test_a_single_environment_can_be_pickled_and_restored(either):
     env.set_state(kept)
     assert np.array_equal(env.step(second)[0], went[0])
     assert np.array_equal(env.reset()[0], start)
+
+
+def test_vessels_move_where_a_motion_is_given_after_the_phase_of_the_ct(near):
+    still, env = (
+        NavigateVectorEnv(WORLDS, navigations=near, motion=each) for each in (None, motion_named("heartbeat"))
+    )
+    assert np.array_equal(still.reset(seed=4)[0], env.reset(seed=4)[0])
+    pushed = np.tile([0.6, 0.2], (WORLDS, 1))
+    lain, moved = ([each.step(pushed)[0] for _ in range(6)] for each in (still, env))
+    assert np.abs(np.subtract(moved, lain)).max() > 0.01
 
 
 def test_a_state_of_another_environment_is_refused(near):
@@ -377,17 +331,13 @@ def test_too_large_a_force_is_reported_and_remembered(near):
 def test_a_wrong_branch_lengthens_the_route():
     navigation = reference_navigation()
     tree = navigation.anatomy.tree
-    env = NavigateEnv(navigations=navigation)
-    env.reset(seed=0)
-    route = tree.route(navigation.target.branch)
+    route, fork = tree.route(navigation.target.branch), tree.branches[0].centerline.abscissa[-1]
     side = next(i for i in range(len(tree.branches)) if i not in route and tree.branches[i].parent == 0)
-    fork = tree.branches[0].centerline.abscissa[-1]
-    tip = replace(
-        env.simulator.project(), abscissa=np.array([[fork + 7.0]]), branch=np.array([[side]]), offset=np.zeros((1, 1))
-    )
-    length = env._worlds._episodes.routes.distance(tip)
-    assert length == pytest.approx(7.0 + navigation.target.abscissa - fork)
-    assert not env._worlds._episodes.routes.on_route(tip).any()
+    one = np.ones((1, 1))
+    tip = TipProjection(abscissa=(fork + 7.0) * one, offset=0.0 * one, branch=side * one.astype(int), radius=one)
+    routes = RouteTables.of([navigation])
+    assert routes.distance(tip) == pytest.approx(7.0 + navigation.target.abscissa - fork)
+    assert not routes.on_route(tip).any()
 
 
 @pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])
@@ -410,15 +360,29 @@ def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
             break
 
 
-def test_bad_arguments_are_one_clear_line(near):
-    with pytest.raises(InputError, match="num_envs: 0"):
-        NavigateVectorEnv(0, navigations=near)
-    with pytest.raises(InputError, match="task: 'moon'"):
-        NavigateVectorEnv(1, task="moon")
-    with pytest.raises(InputError, match="catheter 'hose'"):
-        NavigateVectorEnv(1, catheter="hose")
-    with pytest.raises(InputError, match=r"catheter: microcatheter-1\.7f; give it to the navigations"):
-        NavigateVectorEnv(1, navigations=near, catheter="microcatheter-1.7f")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_envs": 0}, "num_envs: 0"),
+        ({"navigations": None, "task": "moon"}, "task: 'moon'"),
+        ({"navigations": None, "catheter": "hose"}, "catheter 'hose'"),
+        ({"catheter": "microcatheter-1.7f"}, r"catheter: microcatheter-1\.7f; give it to the navigations"),
+        ({"robot": "none"}, "robot 'none': no such robot or file"),
+        ({"render_mode": "human"}, "render_mode: 'human'"),
+        ({"observation": "image", "pixels": 32}, "pixels: 32; give 64 to 128"),
+        ({"world": "none"}, "world 'none': no such world or file"),
+        ({"world": []}, "an empty list"),
+        ({"num_envs": 2, "world": ["nominal", "fine-core"]}, "world: worlds differ in core or wall"),
+        ({"num_envs": 2, "world": ["moving", "nominal"]}, "world: worlds differ in motion"),
+        ({"num_envs": 2, "world": ["nominal", "other-engine"]}, "world: worlds differ in engine"),
+    ],
+)
+def test_bad_arguments_are_one_clear_line(near, change, message):
+    with pytest.raises(InputError, match=message):
+        NavigateVectorEnv(**({"navigations": near} | change))
+
+
+def test_navigations_that_do_not_go_together_are_refused(near):
     coaxial = in_catheter([near], "microcatheter-1.7f")[0]
     with pytest.raises(InputError, match="navigations: differ in catheters"):
         NavigateVectorEnv(2, navigations=[near, coaxial])
@@ -427,21 +391,6 @@ def test_bad_arguments_are_one_clear_line(near):
     slow = replace(near, device=replace(near.device, max_velocity_mm_s=1.0))
     with pytest.raises(InputError, match="max_velocity_mm_s"):
         NavigateVectorEnv(1, navigations=slow)
-
-
-def test_vessels_move_where_a_motion_is_given_and_go_on_from_a_pickle(near):
-    beating = {"navigations": near, "motion": motion_named("heartbeat")}
-    still, env = NavigateVectorEnv(WORLDS, navigations=near), NavigateVectorEnv(WORLDS, **beating)
-    assert np.array_equal(still.reset(seed=4)[0], env.reset(seed=4)[0])  # every episode begins at the phase of the CT
-    actions = _actions(near, steps=6)
-    lain, moved = _rollout(still, actions), _rollout(env, actions)
-    assert np.abs(moved[0] - lain[0]).max() > 0.01
-    one = NavigateEnv(navigations=near, motion=motion_named("heartbeat"))
-    one.reset(seed=5)
-    for step, row in enumerate(actions):
-        assert np.array_equal(one.step(row[1])[0], moved[0][step, 1])
-    copy = pickle.loads(pickle.dumps(env))
-    assert _same(_rollout(copy, actions), _rollout(env, actions))
 
 
 PLAY = RobotConfig(
@@ -463,19 +412,32 @@ def test_a_robot_drives_and_its_encoders_are_observed(near):
     assert np.ptp(infos["load_n"]) > 0 and np.ptp(begun[:, 0]) > 0  # noise of their own
     named = NavigateVectorEnv(1, navigations=near, robot="kweon-2021-2d")
     assert "load_nmm" in named.reset(seed=0)[1]
-    with pytest.raises(InputError, match="robot 'none': no such robot or file"):
-        NavigateEnv(navigations=near, robot="none")
 
 
-def test_worlds_with_robots_do_not_depend_on_each_other_and_go_on_from_a_state(near):
-    env = NavigateVectorEnv(WORLDS, navigations=near, robot=PLAY)
-    start, actions = env.reset(seed=5)[0], _actions(near, steps=40)  # past the time limit
-    kept, stored = env.state, pickle.dumps(env)
-    went = _rollout(env, actions)
-    assert went[3].any()
-    env.set_state(pickle.loads(pickle.dumps(kept)))
-    assert _same(_rollout(env, actions), went)
-    assert _same(_rollout(pickle.loads(stored), actions), went)
-    alone = NavigateVectorEnv(1, navigations=near, robot=PLAY)
-    assert np.array_equal(alone.reset(seed=6)[0][0], start[1])
-    assert _same([values[:, 0] for values in _rollout(alone, actions[:, 1:2])], [values[:, 1] for values in went])
+def test_stable_baselines3_takes_the_worlds_and_finds_what_it_looks_for_at_an_end(ahead):
+    sb3 = pytest.importorskip("stable_baselines3")
+    from endopilot.env.sb3 import make_vec
+
+    near = replace(ahead, seconds=0.6)
+
+    worlds = make_vec("endopilot/Navigate-v0", num_envs=3, navigations=near)
+    same = gymnasium.make_vec("endopilot/Navigate-v0", num_envs=3, navigations=near, autoreset_mode="SameStep")
+    worlds.seed(5)
+    np.testing.assert_array_equal(worlds.reset(), same.reset(seed=5)[0])
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 3, 2))
+    for number, row in enumerate(actions):
+        seen, rewards, ended, infos = worlds.step(row)
+        wanted, earned, _, truncated, info = same.step(row)
+        np.testing.assert_array_equal(seen, wanted)
+        np.testing.assert_array_equal(rewards, np.float32(earned))
+        assert ended.tolist() == truncated.tolist() == [number == 4] * 3
+        for world, said in enumerate(infos if number == 4 else ()):
+            np.testing.assert_array_equal(said["terminal_observation"], info["final_obs"][world])
+            assert said["TimeLimit.truncated"] and said["is_success"] is False
+            assert said["distance_mm"] == info["final_info"]["distance_mm"][world]
+    np.testing.assert_array_equal(worlds.reset(), same.reset()[0])  # the generators go on
+    assert worlds.get_attr("num_envs", indices=[1]) == [3] and not worlds.has_attr("nothing")
+    with pytest.raises(NotImplementedError, match="reset: the worlds are stepped together"):
+        worlds.env_method("reset")
+    model = sb3.PPO("MlpPolicy", worlds, n_steps=8, batch_size=8, n_epochs=1, device="cpu")
+    assert model.learn(24).num_timesteps == 24

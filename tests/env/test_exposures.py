@@ -8,15 +8,16 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from env_checks import same
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.episodes import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
+from endopilot.env.exposures import TipFinder
 from endopilot.env.single import NavigateEnv
-from endopilot.env.tips import TipFinder
-from endopilot.env.vector import NavigateVectorEnv
-from endopilot.errors import InputError
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.env.vector import NavigateVectorEnv, of_world
+from endopilot.simulation.motion import motion_named
 from endopilot.tasks.task import in_catheter, reference_navigation
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
@@ -24,27 +25,19 @@ TIP, ABSCISSA, DISTANCE, SLACK = slice(9, 32), 9, 11, 31
 FORWARD, SEEN_FORWARD = np.array([0.5, 0.2, -1.0]), np.array([0.5, 0.2, 1.0])
 
 
-@pytest.fixture(scope="module")
-def near(fork, wire) -> Navigation:
-    """Return a target 20 mm beyond the fork, to be reached within 2 s."""
-    return Navigation(
-        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=2.0
-    )
-
-
 @pytest.mark.parametrize("observation", ["xray", "image"])
-def test_they_pass_gymnasiums_check_and_are_made_by_name(near, observation):
+def test_they_pass_gymnasiums_check_and_are_made_by_name(ahead, observation):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make("endopilot/NavigateXray-v0", observation=observation, navigations=near).unwrapped)
-    worlds = gymnasium.make_vec("endopilot/NavigateXray-v0", num_envs=2, navigations=near, observation=observation)
+        check_env(gymnasium.make("endopilot/NavigateXray-v0", observation=observation, navigations=ahead).unwrapped)
+    worlds = gymnasium.make_vec("endopilot/NavigateXray-v0", num_envs=2, navigations=ahead, observation=observation)
     observations, _ = worlds.reset(seed=0)
     assert worlds.observation_space.contains(observations)
     assert worlds.observation_space.contains(worlds.step(worlds.action_space.sample())[0])
 
 
-def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(near):
-    env = NavigateEnv(navigations=near, observation="xray", robot="ideal")
+def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(ahead):
+    env = NavigateEnv(navigations=ahead, observation="xray", robot="ideal")
     start, info = env.reset(seed=0)
     assert start.shape == (32,) and (info["exposures"], info["exposed"]) == (1, True)
     assert start[ABSCISSA] * 100 == pytest.approx(info["tip_abscissa"], abs=1.5)
@@ -66,8 +59,8 @@ def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(near):
 
 
 @pytest.mark.parametrize("biplane", [True, False])
-def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(near, wire, biplane):
-    anatomies, config = [near.anatomy, reference_navigation().anatomy], FluoroscopeConfig(biplane=biplane)
+def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(ahead, wire, biplane):
+    anatomies, config = [ahead.anatomy, reference_navigation().anatomy], FluoroscopeConfig(biplane=biplane)
     arms = [Fluoroscope(anatomy, wire.tip_radius_mm, config=config) for anatomy in anatomies]
     random, arm = np.random.default_rng(0), np.array([0, 1, 1] * 20)
     lines = [np.concatenate([branch.centerline.points for branch in a.tree.branches]) for a in anatomies]
@@ -85,8 +78,8 @@ def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(near, w
     np.testing.assert_allclose(part, alone[some], atol=1e-9)
 
 
-def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(near):
-    env = NavigateVectorEnv(2, navigations=near, observation="xray")
+def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(ahead):
+    env = NavigateVectorEnv(2, navigations=ahead, observation="xray")
     env.reset(seed=0)
     seen, *_, infos = env.step(np.tile(FORWARD, (2, 1)))
     np.testing.assert_allclose(seen[:, 0] * 100, infos["encoder_inserted_length"], rtol=1e-5)
@@ -95,8 +88,8 @@ def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(near):
     assert not np.allclose(infos["encoder_inserted_length"], infos["inserted_length"], atol=1e-3)
 
 
-def test_images_show_the_wire_where_it_is_and_only_when_exposed(near):
-    env = NavigateEnv(navigations=near, observation="image", pixels=128, robot="ideal")
+def test_images_show_the_wire_where_it_is_and_only_when_exposed(ahead):
+    env = NavigateEnv(navigations=ahead, observation="image", pixels=128, robot="ideal")
     start, _ = env.reset(seed=0)
     assert start["image"].shape == (2, 128, 128) and start["measured"].shape == (9,)
     for _ in range(8):
@@ -109,59 +102,55 @@ def test_images_show_the_wire_where_it_is_and_only_when_exposed(near):
         around = np.ix_(row + np.arange(-2, 3), column + np.arange(-2, 3))
         assert image[around].min() < old[around].min() - 40  # the wire has come here
         assert (image == 255).sum() == 9  # the target
-    single = NavigateEnv(navigations=near, observation="image", c_arm=FluoroscopeConfig(biplane=False))
+    single = NavigateEnv(navigations=ahead, observation="image", c_arm=FluoroscopeConfig(biplane=False))
     assert single.reset(seed=0)[0]["image"].shape == (1, 64, 64)
 
 
-@pytest.fixture(params=["xray", "image", "catheter", "random"])
-def kind(request, near) -> dict:
+PLAY = RobotConfig(encoders_at="motor", jitter_s=0.05, wire=DriveConfig(play_mm=2.4, gain_sd_translation=0.05))
+KINDS = {
+    "state": {"observation": "state"},
+    "catheter": {"observation": "state", "catheter": True},
+    "moving": {"observation": "state", "motion": motion_named("heartbeat")},
+    "robot": {"observation": "state", "robot": PLAY},
+    "xray": {},
+    "image": {"observation": "image"},
+    "catheter under X-ray": {"catheter": True},
+    "random": {"world": "random", "robot": "random"},
+}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request, ahead) -> dict:
     """Return arguments of environments whose worlds are to be repeatable."""
-    navigation = in_catheter([near], "microcatheter-1.7f")[0] if request.param == "catheter" else near
-    chance = {"world": "random", "robot": "random"} if request.param == "random" else {}
-    return {"navigations": navigation, "observation": "image" if request.param == "image" else "xray"} | chance
+    given = {"observation": "xray"} | KINDS[request.param]
+    catheter = given.pop("catheter", False)
+    return given | {"navigations": in_catheter([ahead], "microcatheter-1.7f")[0] if catheter else ahead}
 
 
 def test_worlds_are_repeated_to_the_bit_alone_from_a_state_and_from_a_pickle(kind):
     env = NavigateVectorEnv(3, **kind)
     start, _ = env.reset(seed=4)
-    assert not _same(_of(start, 0), _of(start, 1))
+    assert not same(of_world(start, 0), of_world(start, 1))
     kept, stored = env.state, pickle.dumps(env)
     shape = (20, 3, env.single_action_space.shape[0])  # past the time limit
     actions = np.random.default_rng(0).uniform(-0.5, 1.0, shape).astype(np.float32)
     went = [env.step(row)[:2] for row in actions]
-    env.set_state(kept)
+    env.set_state(pickle.loads(pickle.dumps(kept)))
     for (seen, reward), row in zip(went, actions, strict=True):
         again, reward_again, *_ = env.step(row)
-        assert _same(again, seen) and np.array_equal(reward, reward_again)
+        assert same(again, seen) and np.array_equal(reward, reward_again)
     copy, alone = pickle.loads(stored), NavigateVectorEnv(1, **kind)
-    assert _same(_of(alone.reset(seed=5)[0], 0), _of(start, 1))
+    assert same(of_world(alone.reset(seed=5)[0], 0), of_world(start, 1))
     for (seen, _), row in zip(went, actions, strict=True):
-        assert _same(copy.step(row)[0], seen)
-        assert _same(_of(alone.step(row[1:2])[0], 0), _of(seen, 1))
-    assert _same(env.reset(seed=4)[0], start)
+        assert same(copy.step(row)[0], seen)
+        assert same(of_world(alone.step(row[1:2])[0], 0), of_world(seen, 1))
+    assert same(env.reset(seed=4)[0], start)
 
 
-def test_a_robot_starts_an_episode_as_it_would_start_the_first(near):
-    env = NavigateVectorEnv(2, navigations=near, robot="kweon-2021-2d", autoreset_mode=AutoresetMode.DISABLED)
+def test_a_robot_starts_an_episode_as_it_would_start_the_first(ahead):
+    env = NavigateVectorEnv(2, navigations=ahead, robot="kweon-2021-2d", autoreset_mode=AutoresetMode.DISABLED)
     courses = []
     for _ in range(2):
         env.reset(seed=1)
         courses.append([env.step(np.full((2, 2), 0.7))[0] for _ in range(7)])
-    assert _same(*courses)
-
-
-def test_too_coarse_an_image_is_refused(near):
-    with pytest.raises(InputError, match="pixels: 32; give 64 to 128"):
-        NavigateEnv(navigations=near, observation="image", pixels=32)
-
-
-def _of(observations, world: int):
-    if isinstance(observations, dict):
-        return {name: values[world] for name, values in observations.items()}
-    return observations[world]
-
-
-def _same(one, other) -> bool:
-    if isinstance(one, dict):
-        return all(np.array_equal(one[name], other[name]) for name in one)
-    return np.array_equal(one, other)
+    assert same(*courses)

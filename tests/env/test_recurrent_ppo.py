@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,8 +11,6 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-
-from endopilot.tasks.navigation import Navigation, Target
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
 
@@ -23,14 +22,11 @@ def learner() -> dict:
 
 
 @pytest.fixture
-def worlds(fork, wire):
-    near = Navigation(
-        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=2.0
-    )
+def worlds(ahead):
     return gymnasium.make_vec(
         "endopilot.env:endopilot/NavigateXray-v0",
         num_envs=4,
-        navigations=near,
+        navigations=ahead,
         autoreset_mode=AutoresetMode.SAME_STEP,
     )
 
@@ -76,11 +72,9 @@ def test_advantages_are_discounted_errors_that_end_with_an_episode(learner):
 
 
 @pytest.mark.parametrize(("name", "looks"), [("state", False), ("xray", True)])
-def test_saved_policies_are_scored_again(learner, fork, wire, monkeypatch, name, looks):
+def test_saved_policies_are_scored_again(learner, ahead, monkeypatch, name, looks):
     """They find a target straight ahead, each in its own way: by the true state, or by exposures that they ask for."""
-    ahead = Navigation(
-        anatomy=fork, device=wire, target=Target(branch=1, abscissa=38.0), start_inserted_length_mm=6.0, seconds=20.0
-    )
+    ahead = replace(ahead, seconds=20.0)
     task = SimpleNamespace(name="ahead", ladder=SimpleNamespace(numbers=(0, 1)), ladder_navigation=lambda _: ahead)
     monkeypatch.setitem(learner["score"].__wrapped__.__globals__, "list_tasks", lambda: (task,))
     ((said, safe, success, count, exposures),) = learner["score"](EXAMPLE.parent / "policies" / f"{name}.pt")

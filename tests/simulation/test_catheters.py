@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 import endopilot
-from benchmarks.core.manoeuvres import paired_controls, seed_of
+from benchmarks.core.manoeuvres import paired_controls
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import Catheter, list_catheters, read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
-from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
@@ -97,16 +95,6 @@ def tight() -> tuple[Anatomy, Stack, np.ndarray, np.ndarray]:
     return artery, stack, *paired_controls(artery, stack, rollouts=20, samples=120, seed=seed)
 
 
-def test_a_drive_that_slips_as_it_is_brought_in_does_not_notice_a_longer_neighbour(
-    tight: tuple[Anatomy, Stack, np.ndarray, np.ndarray],
-) -> None:
-    artery, stack, start, control = tight
-    start, control = start[[17, 17]], control[[17, 17], :2]
-    start[1, 1, 0] = 60.0
-    alone, both = (endopilot.simulate(artery, stack, control[:count], initial=start[:count]) for count in (1, 2))
-    assert np.array_equal(alone.tip_position[0], both.tip_position[0])
-
-
 @pytest.mark.filterwarnings("ignore:.*press the wall")
 def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on(
     tight: tuple[Anatomy, Stack, np.ndarray, np.ndarray],
@@ -151,15 +139,6 @@ def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, cathe
     assert moved < 1.5  # it leans on the wall as its own stiffness has it
 
 
-def robust_world(index: int, catheter: str, world: int, *, samples: int, rollouts: int) -> tuple[Stack, Trajectory]:
-    """Simulate the first samples of a world of `bench robustness --catheters`: the workhorse wire in a catheter."""
-    vessel, stack = make_patient(AtlasConfig(), index), Stack(read_wire("workhorse-014"), (read_catheter(catheter),))
-    seed, one = seed_of(index, seed=0), slice(world, world + 1)
-    initial, control = paired_controls(vessel, stack, rollouts=rollouts, samples=120, seed=seed)
-    config = SimulatorConfig(threads=1)
-    return stack, endopilot.simulate(vessel, stack, control[one, :samples], initial=initial[one], config=config)
-
-
 def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
     weak = replace(catheter, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
     start = np.array([[[60.0, 0.0], [20.0, 0.0]]])
@@ -199,39 +178,6 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     assert (np.abs(trajectory.slip).sum(axis=1) > 5).any(axis=0).all()
     for device in range(2):
         assert 0.9 * 0.3 < np.abs(trajectory.base_force[..., device]).max() < 1.1 * 0.3
-
-
-def test_drives_of_random_pairs_keep_their_limits() -> None:
-    # A force that would leap beyond its limit because friction turns is kept within 5 % of it.
-    vessel = make_patient(AtlasConfig(), 5)
-    stack = Stack(read_wire("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
-    initial, control = paired_controls(vessel, stack, rollouts=16, samples=240, seed=11)
-    worlds = [10, 15]  # those in which it would leap to 1.07 and 1.14 times its limit
-    config = SimulatorConfig(threads=1)
-    trajectory = endopilot.simulate(vessel, stack, control[worlds, :30], initial=initial[worlds], config=config)
-    assert trajectory.valid.all()
-    limits = np.array([[device.push_limit_n, -device.pull_limit_n] for device in stack.devices])
-    share = (trajectory.base_force[..., None] / limits).max(axis=-1)
-    assert (share > 0.99).mean() > 0.01
-    assert share.max() < 1.055
-
-
-def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
-    """Where the lead slips, the force of all tubes is at most the sum of the limits; it stayed at 5.1 N, not 1 N."""
-    stack, trajectory = robust_world(46, "microcatheter-1.7f", 15, samples=76, rollouts=20)
-    assert trajectory.valid.all()
-    forces = trajectory.base_force[0, 72:]
-    pull = sum(device.pull_limit_n for device in stack.devices)
-    assert (forces.sum(axis=-1) < -0.9 * pull).any()  # both pull in vain
-    assert forces.sum(axis=-1).min() > -1.05 * pull
-    assert forces.min() > -1.5 * stack.catheters[0].pull_limit_n
-
-
-def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
-    """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
-    stack, trajectory = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
-    assert np.abs(trajectory.base_force[..., 1]).max() > 0.99 * stack.catheters[0].push_limit_n
-    assert trajectory.valid.all()
 
 
 def test_a_trajectory_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:

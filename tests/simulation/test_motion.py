@@ -12,9 +12,7 @@ import pytest
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
 from endopilot.cli import simulate as command
-from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
-from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, draw_motion, motion_named, place
@@ -125,18 +123,6 @@ def test_a_contracting_vessel_loads_the_wire(anatomy: Anatomy) -> None:
     moving = simulate(anatomy, DEVICE, control, initial=initial, motion=BEATS)
     assert moving.valid.all()
     assert np.abs(moving.tip.abscissa - still.tip.abscissa).max() > 0.5
-
-
-def test_wires_in_catheters_move_with_the_vessel_too(anatomy: Anatomy) -> None:
-    initial, control = drives(2, 4)
-    stack, config = Stack(DEVICE, (read_catheter("microcatheter-1.7f"),)), SimulatorConfig(tolerance_mm=1e-7)
-    both, start = np.stack([control, 0.5 * control], axis=2), np.stack([initial, 0.5 * initial], axis=1)
-    still, moving, beating = (
-        simulate(anatomy, stack, both, initial=start, config=config, motion=motion)
-        for motion in (None, motion_named("breathing"), BEATS)
-    )
-    np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=2e-3)
-    assert (np.abs(beating.tip_position - still.tip_position).max(axis=(0, 1, 3)) > 0.3).all()
 
 
 def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:

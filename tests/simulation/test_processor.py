@@ -52,18 +52,7 @@ def test_a_machine_without_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         core_for("cuda")
 
 
-def test_the_gpu_steps_whole_navigations(monkeypatch: pytest.MonkeyPatch, anatomy: Anatomy) -> None:
-    given = put_gpu(monkeypatch)
-    control = np.tile([4.0, 0.5], (3, 2, 1))
-    on_gpu = simulate(anatomy, DEVICE, control, config=GPU)
-    assert given == [3]
-    assert np.array_equal(on_gpu.tip_position, simulate(anatomy, DEVICE, control, config=CPU).tip_position)
-    assert given == [3]
-
-
-def test_the_gpu_steps_a_simulator_and_its_state_goes_anywhere(
-    monkeypatch: pytest.MonkeyPatch, anatomy: Anatomy
-) -> None:
+def test_the_gpu_steps_worlds_and_their_state_goes_anywhere(monkeypatch: pytest.MonkeyPatch, anatomy: Anatomy) -> None:
     given = put_gpu(monkeypatch)
     on_gpu, here = (Simulator(anatomy, DEVICE, worlds=2, config=config) for config in (GPU, CPU))
     assert given == [2]

@@ -110,21 +110,6 @@ def test_the_zero_of_a_straight_vessel_is_the_front_of_the_patient_or_its_head(d
     assert tree.rotation_zero(Insertion(np.zeros(3), np.array(direction))) == pytest.approx(np.array(zero))
 
 
-def test_a_vessel_changed_by_a_tenth_of_a_mm_turns_its_zero_little():
-    anatomy, random = vessel(Rotation.identity()), np.random.default_rng(1)
-    zero, turned_deg = zero_of(anatomy), []
-    for _ in range(50):
-        branches = tuple(
-            replace(b, centerline=replace(b.centerline, points=b.centerline.points + random.normal(0, 0.1, (1, 3))))
-            for b in anatomy.tree.branches
-        )
-        axis = turned_axis(anatomy.insertion.direction, np.degrees(0.1 / 1.5), 360.0 * random.random())
-        insertion = Insertion(branches[0].centerline.points[0], axis)
-        other = replace(anatomy.tree, branches=branches).rotation_zero(insertion)
-        turned_deg.append(float(np.degrees(np.arccos(np.clip(zero @ other, -1, 1)))))
-    assert max(turned_deg) < 15.0 and np.median(turned_deg) < 8.0
-
-
 def test_the_zero_turns_with_a_catheter_that_leans():
     anatomy = vessel(TURNS[0])  # along −z, where a zero by the world's axes spins
     axis = anatomy.insertion.direction

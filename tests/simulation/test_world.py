@@ -265,14 +265,18 @@ def test_an_unknown_world_names_those_that_are_there():
         read_world("none")
 
 
+@pytest.fixture(scope="module")
+def plain(straight):
+    return drive(replace(straight, seconds=2.0))
+
+
 @pytest.mark.parametrize("name", list_worlds())
-def test_a_shipped_world_says_what_it_is_and_is_driven_in(name, straight):
+def test_a_shipped_world_says_what_it_is_and_is_driven_in(name, straight, plain):
     world = read_world(name)
     assert (name == NOMINAL) or (world.about and "\n" not in world.about and len(world.differences()) > 1)
     record = drive(replace(straight, seconds=2.0), world)
     assert record.reason in ("time", "reached") and record.trajectory.valid.all()
     assert record.cycles.about["world"] == NavigationLoop(straight, Forward(), world=world).world.differences()
-    plain = drive(replace(straight, seconds=2.0))
     if name not in (NOMINAL, "backing-out", "stenosis"):  # those begin later, or deeper
         same = record.tip_position[-1].tolist() == plain.tip_position[-1].tolist()
         seen = [m.position.tolist() for m in record.measured[:-1]] == [m.position.tolist() for m in plain.measured[:-1]]

@@ -22,7 +22,7 @@ from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.motion import Motion, MotionName, motion_named
-from endopilot.simulation.simulate import simulate, wall_force_events
+from endopilot.simulation.simulate import simulate, wall_force_worlds
 from endopilot.simulation.trajectory import Trajectory, read_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
@@ -124,7 +124,7 @@ def command(
         "deepest_tip_mm": _largest(trajectory.tip.abscissa[..., 0], valid),
         "largest_contact_force_n": _largest(trajectory.contact_force_max, valid),
         "largest_wall_force_n": _largest(trajectory.wall_force, valid),
-        "wall_force_worlds": len(wall_force_events(trajectory)),
+        "wall_force_worlds": len(wall_force_worlds(trajectory)),
         "largest_base_force_n": _largest(force[..., 0], valid),
         "largest_base_torque_n_mm": _largest(torque[..., 0], valid),
     }

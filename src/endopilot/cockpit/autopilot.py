@@ -14,7 +14,6 @@ import numpy as np
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import LiveWorld, Snapshot
 from endopilot.devices.stack import Proximals, shown_part
-from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.tasks.navigation import Navigation, Target
@@ -86,10 +85,10 @@ class Autopilot:
             return self._end("reached")
         if not self._started:
             self._turned = (0.0, *(turn for _, turn in loop.robot.proximal_state().devices[1:]))
-            if crooked := self._turned_catheter():
-                return self._end(
-                    "failed", f"{self.policy_name}: begins with unturned catheters; turn {crooked} back to 0° first"
-                )
+            for catheter, turn in zip(self._world.navigation.catheters, self._turned[1:], strict=True):
+                if catheter.shape and np.cos(turn) < np.cos(_UNTURNED_RAD):  # which the policy would take for unturned
+                    why = f"{self.policy_name}: begins with unturned catheters; turn {catheter.name} back to 0° first"
+                    return self._end("failed", why)
         observation = self._world.observe() if self.drives else self._world.begin()
         if observation.tip is not None:
             expose()
@@ -189,13 +188,6 @@ class Autopilot:
             seconds=SECONDS,
         )
 
-    def _turned_catheter(self) -> str:
-        """Return the name of a curved catheter that the policy would take for unturned and is not; empty if none is."""
-        for catheter, turn in zip(self._world.navigation.catheters, self._turned[1:], strict=True):
-            if catheter.shape and np.cos(turn) < np.cos(_UNTURNED_RAD):
-                return catheter.name
-        return ""
-
     def _decide(self, start: Navigation | None, observation: Observation) -> Decision:
         if self._policy is None:
             self._policy = self._world.loop.policy = make_policy(self.policy_name)
@@ -206,10 +198,3 @@ class Autopilot:
     def _watch(self, start: Navigation | None, observation: Observation) -> None:
         if isinstance(self._policy, Led):
             self._policy.watch(observation)
-
-
-def check_policy(name: str | None, offered: tuple[str, ...]) -> str:
-    """Return a policy's name that the page may choose: one that is offered, for a page names no module of its own."""
-    if name not in offered:
-        raise InputError(f"policy: {name!r}; choose from {', '.join(offered)}")
-    return name

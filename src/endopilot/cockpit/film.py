@@ -232,8 +232,8 @@ class ReplayStage:
         sent: list[tuple[str, bytes]] = []
         self.at = min(self.at, len(self.film.frames) - 1)
         frame = self.film.frames[self.at]
+        images = self._xray.pulse(frame.snapshot)
         if self._xray.ready:
-            images = self._xray.pulse(frame.snapshot)
             if images is None and frame.exposed and self._shown != self.at:
                 images = self._xray.expose(frame.snapshot)
             self._shown = self.at

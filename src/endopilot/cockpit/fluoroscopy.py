@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,15 +69,14 @@ class XrayUnit:
         self.background = "plain" if ct is None else "CT"
         self._image_s = self._contrast_s = -np.inf
         self._next_s = 0.0
-        self._planes: dict[tuple[Any, ...], Plane] = {}
-        self._fine: set[tuple[Any, ...]] = set()
         self._roadmap: dict[tuple[Any, ...], np.ndarray] = {}
-        self._lock, self._pool = threading.Lock(), ThreadPoolExecutor(1)
-        self._failed: BaseException | None = None
-        self._imager = make_imager(ct)
+        self._pool = ThreadPoolExecutor(1, initializer=_give_way)
+        self._views: dict[tuple[Any, ...], list[Future[Plane]]] = {}  # by plane, first coarse, then fine
+        self.imager = make_imager(ct)
         self._prepare()
-        self._later = ct is None and is_coronary(anatomy)
-        self._surroundings = lambda: self._surround(anatomy, make_imager)
+        self._around: Future[XrayImager] | None = None
+        phantom = ct is None and is_coronary(anatomy)
+        self._surroundings = (lambda: make_imager(surroundings(anatomy))) if phantom else None
 
     def configure(self, **changes: Any) -> None:
         """Turn or set the C-arm; `changes` are fields of `XraySettings`."""
@@ -91,8 +90,12 @@ class XrayUnit:
     @property
     def ready(self) -> bool:
         """Whether the C-arm stands where it was asked to."""
-        with self._lock:
-            return all(plane in self._planes for plane in self.settings.planes)
+        return all(self.plane(plane) is not None for plane in self.settings.planes)
+
+    def plane(self, key: tuple[Any, ...]) -> Plane | None:
+        """Return the finest view that there is yet of a plane of `settings`; raises what kept it from being made."""
+        done = [view for view in self._views.get(key, ()) if view.done()]
+        return done[-1].result() if done else None
 
     def contrast(self, now_s: float) -> float:
         """Return the share of the full contrast in the vessel at a time of the world, s."""
@@ -102,11 +105,11 @@ class XrayUnit:
 
     def pulse(self, snapshot: Snapshot) -> list[bytes] | None:
         """Return the images of a pulse if one is due, as messages for the page, else None."""
-        if self._failed is not None:
-            raise RuntimeError("the X-ray image could not be computed") from self._failed
-        if self._later:  # with the first cycle, so that the page is there before
-            self._later = False
-            self._pool.submit(self._work, self._surroundings)
+        if self._surroundings is not None:  # with the first cycle, so that the page is there before
+            self._around, self._surroundings = self._pool.submit(self._surroundings), None
+        if self._around is not None and self._around.done():
+            self.imager, self._around, self._views, self.background = self._around.result(), None, {}, "phantom"
+            self._prepare()
         period = 1 / self.settings.frames_per_s
         self._next_s = min(self._next_s, snapshot.time_s + period)  # a replay may go back in time
         if not (self.pedal and self.ready and snapshot.time_s >= self._next_s - 1e-9):
@@ -121,13 +124,13 @@ class XrayUnit:
         share = self.contrast(snapshot.time_s)
         messages = []
         for number, key in enumerate(self.settings.planes):
-            with self._lock:
-                plane = self._planes[key]
-            self.kerma_ugy += self._imager.air_kerma_ugy(plane, self.settings.dose)
+            plane = self.plane(key)
+            assert plane is not None
+            self.kerma_ugy += self.imager.air_kerma_ugy(plane, self.settings.dose)
             if share >= 0.9:
                 self._roadmap[key] = plane.vessel_mm
             seed = 2 * self.frames + number
-            signal = self._imager.signal(
+            signal = self.imager.signal(
                 plane,
                 snapshot.nodes,
                 contrast=share,
@@ -136,7 +139,7 @@ class XrayUnit:
                 catheters=[catheter.nodes for catheter in snapshot.catheters],
             )
             roadmap = self._roadmap.get(key) if self.settings.roadmap and share == 0 else None
-            image = self._imager.grey(signal, roadmap=roadmap)
+            image = self.imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}
             messages.append(encode("image", header, grey=image))
         return messages
@@ -166,9 +169,9 @@ class XrayUnit:
         """Return where a point of the patient, LPS mm, lies in the image of each plane: column and row."""
         found = []
         for angles, factor in self.settings.planes:
-            view = view_at(angles, self._imager.isocenter, self._imager.config.geometry)
+            view = view_at(angles, self.imager.isocenter, self.imager.config.geometry)
             right, up = factor * view.project(point)
-            middle = (self._imager.config.pixels - 1) / 2
+            middle = (self.imager.config.pixels - 1) / 2
             found.append([round(middle + float(right), 1), round(middle - float(up), 1)])
         return found
 
@@ -176,34 +179,16 @@ class XrayUnit:
         """Stop computing."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _surround(self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager]) -> None:
-        """Put the phantom around the vessel, and compute the views again."""
-        imager = make_imager(surroundings(anatomy))
-        planes = {key: imager.plane(*key, rays=_COARSE) for key in self.settings.planes}
-        with self._lock:
-            self._imager, self._planes, self._fine, self.background = imager, planes, set(), "phantom"
-        self._prepare()
-
     def _prepare(self) -> None:
+        """Compute the views that the C-arm is to show, first coarsely, and give up those that it no longer is."""
+        for key in self._views.keys() - set(self.settings.planes):
+            for view in self._views.pop(key):
+                view.cancel()
         for key in self.settings.planes:
-            for rays in (_COARSE, _FINE):
-                self._pool.submit(self._work, lambda key=key, rays=rays: self._compute(key, rays))
+            if key not in self._views:
+                self._views[key] = [self._pool.submit(self.imager.plane, *key, rays=rays) for rays in (_COARSE, _FINE)]
 
-    def _compute(self, key: tuple[Any, ...], rays: int) -> None:
-        with self._lock:
-            if key not in self.settings.planes or key in self._fine or (rays == _COARSE and key in self._planes):
-                return
-            imager = self._imager
-        plane = imager.plane(*key, rays=rays)
-        with self._lock:
-            self._planes[key] = plane
-            if rays == _FINE:
-                self._fine.add(key)
 
-    def _work(self, task: Callable[[], None]) -> None:
-        if hasattr(os, "setpriority"):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        try:
-            task()
-        except Exception as error:  # shown in the page by the next pulse, not lost in a thread
-            self._failed = error
+def _give_way() -> None:
+    if hasattr(os, "setpriority"):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

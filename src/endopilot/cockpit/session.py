@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from endopilot.cockpit import messages
-from endopilot.cockpit.autopilot import Autopilot, check_policy
+from endopilot.cockpit.autopilot import Autopilot
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.cockpit.messages import Message
@@ -194,7 +194,9 @@ class Session:
 
     def _steer(self, message: messages.Autopilot) -> None:
         if message.action == "start":
-            self.autopilot.start(check_policy(message.policy, self._policies), self.target)
+            if message.policy not in self._policies:  # a page names no module of its own
+                raise InputError(f"policy: {message.policy!r}; choose from {', '.join(self._policies)}")
+            self.autopilot.start(message.policy, self.target)
             if self._moving:
                 self._move(self._rest)
                 self._moving = False

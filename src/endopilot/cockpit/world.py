@@ -58,7 +58,6 @@ class Snapshot(ShownDevice):
 
     cycle: int
     time_s: float
-    tip_direction: Float[np.ndarray, "3"]
     velocity: tuple[float, ...]
     force_n: float
     wall_force_n: float
@@ -177,7 +176,6 @@ def take_snapshot(
         **vars(wire),
         cycle=cycle,
         time_s=time_s,
-        tip_direction=simulator.tip_direction[0, 0],
         velocity=velocity,
         force_n=force_n,
         wall_force_n=0.0 if step is None else float(step.wall_force[0]),

@@ -33,8 +33,6 @@ from endopilot.simulation.robots import in_grip
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import World
 
-_WORK_PATH = "meta/work.json"  # what the files so far have cost; moves into the manifest in the end
-
 
 def generate_dataset(
     anatomies: Sequence[str | Path],
@@ -75,16 +73,16 @@ def generate_dataset(
         config = replace(config, simulator=core)
     layout = make_layout(folders, Path(output), stack, config, robot=robot, world=world)
     blocks = layout.blocks()
-    claim(layout.context.output, "endopilot dataset", **layout.settings)
-    if _is_finished(layout, blocks):
+    claim(layout.output, "endopilot dataset", **layout.settings)
+    described = [layout.output / name for name in schema.DESCRIPTION]  # the manifest last
+    missing = [block for block in blocks if not all(map(_is_whole, schema.paths_of_file(layout.output, block.number)))]
+    if not missing and all(map(_is_whole, described)):
         return
-    (layout.context.output / schema.MANIFEST_PATH).unlink(missing_ok=True)
-    paths = {block.number: schema.paths_of_file(layout.context.output, block.number) for block in blocks}
-    missing = [block for block in blocks if not all(map(_is_whole, paths[block.number]))]
+    described[-1].unlink(missing_ok=True)
+    work = {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0}  # of this run, which others began perhaps
     samples, to_do = (sum(len(block.sequences) for block in some) * config.samples for some in (blocks, missing))
     with progress("Simulating navigations", total=samples) as advance:
         advance(samples - to_do)
-        ledger = _Ledger(layout)
         simulated, start = 0, time.perf_counter()
 
         def report(amount: int) -> None:
@@ -92,46 +90,21 @@ def generate_dataset(
             simulated += amount
             advance(amount, f"{simulated / (time.perf_counter() - start):,.0f} samples/s")
 
-        def done_remotely(block: Block, seconds: float) -> None:
-            ledger.add(block, seconds)
-            report(len(block.sequences) * config.samples)
+        def done(block: Block, seconds: float) -> None:
+            work["samples"] += len(block.sequences) * config.samples
+            work["processor_seconds"] += seconds
+            if scheduler is not None:
+                report(len(block.sequences) * config.samples)
 
         if scheduler is None:
-            run_locally(layout.context, missing, ledger.add, report)
+            run_locally(layout, missing, done, report)
         else:
-            remote = [replace(block, folder=block.folder.resolve()) for block in missing]
-            context = replace(layout.context, output=layout.context.output.resolve())
-            run_on_cluster(partial(write_timed, context), remote, done_remotely, scheduler)
-    describe(layout, blocks)
-
-
-class _Ledger:
-    def __init__(self, layout: Layout) -> None:
-        self._path, self._samples = layout.context.output / _WORK_PATH, layout.context.config.samples
-        self._cost = read_work(layout.context.output)
-        self._then = time.perf_counter()
-
-    def add(self, block: Block, processor_seconds: float) -> None:
-        now = time.perf_counter()
-        self._cost["samples"] += len(block.sequences) * self._samples
-        self._cost["processor_seconds"] += processor_seconds
-        self._cost["wall_seconds"] += now - self._then
-        self._then = now
-        write_json(self._path, self._cost)
-
-
-def read_work(output: Path) -> dict[str, Any]:
-    """Return `samples`, and the `processor_seconds` and `wall_seconds` that they took, of an unfinished dataset."""
-    path = output / _WORK_PATH
-    return read_json(path) if path.exists() else {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0}
-
-
-def _is_finished(layout: Layout, blocks: Sequence[Block]) -> bool:
-    """Return whether the manifest, which is written last, and all other files are there to their ends."""
-    output = layout.context.output
-    files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
-    described = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.MANIFEST_PATH)
-    return all(map(_is_whole, (*files, *(output / name for name in described))))
+            remote = replace(layout, output=layout.output.resolve())
+            there = (block.patient._replace(folder=block.patient.folder.resolve()) for block in missing)
+            items = [replace(block, patient=patient) for block, patient in zip(missing, there, strict=True)]
+            run_on_cluster(partial(write_timed, remote), items, done, scheduler)
+        work["wall_seconds"] = time.perf_counter() - start
+    describe(layout, blocks, work)
 
 
 def _is_whole(file: Path) -> bool:
@@ -142,47 +115,51 @@ def _is_whole(file: Path) -> bool:
         return False
 
 
-def describe(layout: Layout, blocks: Sequence[Block]) -> None:
-    """Write what describes a dataset whose blocks are there: statistics, task, info, and last the manifest."""
+def describe(layout: Layout, blocks: Sequence[Block], work: dict[str, Any]) -> None:
+    """Write what describes a dataset whose blocks are there: statistics, task, info, and last the manifest, with the
+    `work` that the blocks took: `samples`, and their `processor_seconds` and `wall_seconds`."""
     import pandas as pd  # slow to import, and only needed here
 
-    context = layout.context
-    remove_partial_files(context.output)
-    files = [schema.paths_of_file(context.output, block.number) for block in blocks]
+    output, config = layout.output, layout.config
+    remove_partial_files(output)
+    info_path, stats_path, tasks_path, manifest_path = (output / name for name in schema.DESCRIPTION)
+    files = [schema.paths_of_file(output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
-    episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
+    episodes = parquet.read_tables([path for _, path in files], layout.key).select(columns).to_pylist()
     started = time.process_time()
-    described = schema.features(context.config.control, len(context.stack), by_robot=context.robot is not None)
+    described = schema.features(config.control, len(layout.stack), by_robot=layout.robot is not None)
     with progress("Describing the dataset", total=len(files)) as advance:
-        stats, shares = parquet.statistics(described, [path for path, _ in files], context.key, advance)
-    work = read_work(context.output)
+        stats, shares = parquet.statistics(described, [path for path, _ in files], layout.key, advance)
     work["processor_seconds"] += time.process_time() - started
-    write_json(context.output / schema.STATS_PATH, stats)
-    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([context.task], name="task"))
-    with writing(context.output / schema.TASKS_PATH) as partial:
+    write_json(stats_path, stats)
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([layout.task], name="task"))
+    with writing(tasks_path) as partial:
         tasks.to_parquet(partial)
-    samples = context.config.samples
-    info = schema.info(described, episodes=len(episodes), samples=len(episodes) * samples)
-    write_json(context.output / schema.INFO_PATH, info)
+    write_json(info_path, schema.info(described, episodes=len(episodes), samples=len(episodes) * config.samples))
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
-    where = (os.path.relpath(folder.resolve(), context.output.resolve()) for folder in layout.folders)
-    motions = (None if motion is None else asdict(motion) for motion in layout.motions)
-    parts = zip(layout.names, where, layout.identities, motions, strict=True)
-    anatomies = [dict(zip(("name", "folder", "sha256", "motion"), part, strict=True)) for part in parts]
+    anatomies = [
+        {
+            "name": patient.name,
+            "folder": os.path.relpath(patient.folder.resolve(), output.resolve()),
+            "sha256": patient.identity,
+            "motion": None if patient.motion is None else asdict(patient.motion),
+        }
+        for patient in layout.patients
+    ]
     record = manifest(
-        config=context.config,
-        seed=context.config.seed,
-        inputs=dict(zip(layout.names, layout.identities, strict=True)),
-        key=context.key,
+        config=config,
+        seed=config.seed,
+        inputs={patient.name: patient.identity for patient in layout.patients},
+        key=layout.key,
         settings=layout.settings,
         files=len(files),
-        samples_per_episode=samples,
-        device=asdict(context.stack.wire),
-        catheters=[asdict(catheter) for catheter in context.stack.catheters],
-        robot=None if context.robot is None else asdict(context.robot),
-        world=context.world.differences(),
+        samples_per_episode=config.samples,
+        device=asdict(layout.stack.wire),
+        catheters=[asdict(catheter) for catheter in layout.stack.catheters],
+        robot=None if layout.robot is None else asdict(layout.robot),
+        world=layout.world.differences(),
         anatomies=anatomies,
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,
@@ -190,8 +167,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         invalid={"episodes": len(invalid), "which": invalid},
         work=work,
     )
-    write_json(context.output / schema.MANIFEST_PATH, record)
-    (context.output / _WORK_PATH).unlink(missing_ok=True)
+    write_json(manifest_path, record)
 
 
 def write_episode(
@@ -221,7 +197,8 @@ def write_episode(
     )
     moved = {"motion": None if set_up.motion is None else asdict(set_up.motion)}
     layout = make_layout([anatomy_folder], output, stack, config, task=task, origin={**origin, **moved})
-    layout = replace(layout, motions=(set_up.motion,))  # it was not drawn with the seed
+    patients = (layout.patients[0]._replace(motion=set_up.motion),)  # it was not drawn with the seed
+    layout = replace(layout, patients=patients)
     (block,) = layout.blocks()
     claim(output, "endopilot navigate", **layout.settings)
     drawn = Draw(
@@ -231,5 +208,5 @@ def write_episode(
         tip_bend_rad=np.array([stack.wire.tip_bend_rad]),
         tip_stiffness_factor=np.array([tip_stiffness_factor]),
     )
-    store_block(layout.context, block, drawn, trajectory, np.array([False]))
-    describe(layout, [block])
+    store_block(layout, block, drawn, trajectory, np.array([False]))
+    describe(layout, [block], {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0})

@@ -16,34 +16,18 @@ from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.files import reading, writing
 from endopilot.types import SAMPLE_PERIOD_S
 
-BINS = 400
 _QUANTILES = {"p5": 0.05, "median": 0.5, "p95": 0.95, "p99": 0.99}
-
-
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """How often a quantity took which value in valid samples; outermost bins count what lies beyond."""
-
-    title: str
-    unit: str
-    edges: Float[np.ndarray, "bins_1"]
-    counts: Float[np.ndarray, "bins"]
-
-    def quantiles(self) -> dict[str, float]:
-        """Return the 5th, 50th, 95th and 99th percentile, to within a bin."""
-        below = np.append(0.0, np.cumsum(self.counts)) / max(self.counts.sum(), 1.0)
-        return {name: round(float(np.interp(q, below, self.edges)), 5) for name, q in _QUANTILES.items()}
+_COLOUR, _LEAST_N, _BINS = "#0072B2", 1e-4, 50
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A dataset in figures: histograms by the name of their picture, the share of the navigations whose tip was in n =
-    0, 1, ... branches, and the share of the samples of each manoeuvre."""
+    """A dataset in figures, and what its pictures show by their names: the valid samples of quantities, and the shares
+    of navigations whose tip was in so many branches and of samples of each manoeuvre, each with its label."""
 
     figures: dict[str, Any]
-    histograms: dict[str, Histogram]
-    branch_visits: Float[np.ndarray, "branches"]
-    manoeuvres: dict[str, float]
+    quantities: dict[str, tuple[str, Float[np.ndarray, "samples"]]]
+    shares: dict[str, tuple[str, dict[str, float]]]
 
 
 def describe_dataset(folder: Path) -> Description:
@@ -61,16 +45,14 @@ def _described(data: Dataset) -> Description:
         for signal in (data.inserted_length, data.tip_offset, data.lumen_radius, data.contact_force_max)
     )
     wall_ratio = safety_ratio(offset, radius, manifest["device"]["diameter_mm"] / 2)
-    length_mm, ratios = np.linspace(0.0, max(deepest.max(initial=0.0), 1.0), BINS + 1), np.linspace(0.0, 1.2, BINS + 1)
-    forces = np.append(0.0, np.geomspace(1e-4, 10.0, BINS))
-    histograms = {
-        "insertion": _counted("inserted length Δ", "mm", length_mm, deepest),
-        "offset-ratio": _counted("offset ratio γ/r", "", ratios, offset / radius),
-        "wall-ratio": _counted("offset ratio γ/(r − r_w)", "", ratios, wall_ratio),
-        "contact-force": _counted("largest contact force", "N", forces, force),
+    quantities = {
+        "insertion": ("inserted length Δ mm", deepest),
+        "offset-ratio": ("offset ratio γ/r", offset / radius),
+        "wall-ratio": ("offset ratio γ/(r − r_w)", wall_ratio),
+        "contact-force": ("largest contact force N", force),
     }
     visited = 1 + (np.diff(np.sort(data.branch[valid.all(axis=1), :, 0], axis=1), axis=1) != 0).sum(axis=1)
-    branch_visits = np.bincount(visited, minlength=1) / max(len(visited), 1)
+    visits = {str(n): count / len(visited) for n, count in enumerate(np.bincount(visited).tolist()) if n > 0}
     pairs = set(zip(data.split.tolist(), data.anatomy.tolist(), strict=True))
     reasons = Counter(re.sub(r" after .*", "", each["invalid_reason"]) for each in manifest["invalid"]["which"])
     files = [file for file in data.folder.rglob("*") if file.is_file()]
@@ -93,16 +75,20 @@ def _described(data: Dataset) -> Description:
         "stopped_short": manifest["stopped_short"],
         "invalid": len(manifest["invalid"]["which"]),
         "invalid_reasons": dict(reasons),
-        **{f"{h.title} {h.unit}".strip(): h.quantiles() for h in histograms.values()},
-        "branches visited": {str(n): round(float(share), 4) for n, share in enumerate(branch_visits) if share},
+        **{label: _quantiles(values) for label, values in quantities.values()},
+        "branches visited": {n: round(share, 4) for n, share in visits.items() if share},
         **{name: [round(float(of(values)), 4) for of in (np.min, np.max)] for name, values in of_wire.items()},
     }
-    return Description(figures, histograms, branch_visits, manifest["manoeuvres"])
+    shares = {
+        "branches": ("navigations by the branches that the tip was in", visits),
+        "manoeuvres": ("samples", manifest["manoeuvres"]),
+    }
+    return Description(figures, quantities, shares)
 
 
-def _counted(title: str, unit: str, edges: Float[np.ndarray, "bins_1"], values: Float[np.ndarray, "n"]) -> Histogram:
-    counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
-    return Histogram(title, unit, edges, counts.astype(float))
+def _quantiles(values: Float[np.ndarray, "samples"]) -> dict[str, float]:
+    found = np.quantile(values, list(_QUANTILES.values())) if len(values) else np.zeros(len(_QUANTILES))
+    return dict(zip(_QUANTILES, found.round(5).tolist(), strict=True))
 
 
 def draw_pictures(description: Description, folder: Path) -> list[Path]:
@@ -110,57 +96,27 @@ def draw_pictures(description: Description, folder: Path) -> list[Path]:
     from matplotlib.figure import Figure  # slow to import
 
     paths = []
-
-    def keep(name: str, figure: Figure) -> None:
+    for name, (label, shown) in (description.quantities | description.shares).items():
+        figure = Figure(figsize=(6.0, 3.4), layout="constrained")
+        axes = figure.add_subplot()
+        axes.spines[["top", "right"]].set_visible(False)
+        if isinstance(shown, dict):
+            axes.bar_label(axes.bar(list(shown), [100 * share for share in shown.values()], color=_COLOUR), fmt="%.1f")
+            axes.set_ylabel(f"{label}, %")
+        else:
+            bins: Any = _BINS
+            if name == "contact-force":
+                bins = np.geomspace(_LEAST_N, max(shown.max(initial=0.0), 1.0), _BINS)
+                none = 100 * (shown < _LEAST_N).mean() if len(shown) else 0.0
+                axes.set_xscale("log")
+                axes.set_title(f"below {1e3 * _LEAST_N:g} mN in {none:.1f} % of the samples", fontsize=10)
+            axes.hist(shown, bins, weights=np.full(len(shown), 100 / max(len(shown), 1)), color=_COLOUR)
+            for text, style in (("median", "-"), ("p95", "--")):
+                value = description.figures[label][text]
+                axes.axvline(value, color="#333333", lw=1, ls=style, label=f"{text} {value:.3g}")
+            axes.legend(frameon=False)
+            axes.set(xlabel=label, ylabel="samples, %")
         paths.append(folder / f"{name}.png")
         with writing(paths[-1]) as partial:
             figure.savefig(partial, dpi=150)
-
-    for name, histogram in description.histograms.items():
-        keep(name, _histogram_figure(histogram, logarithmic=name == "contact-force"))
-    visits = {str(n): float(share) for n, share in enumerate(description.branch_visits) if n > 0}
-    keep("branches", _bars("branches that the tip was in", "navigations", visits))
-    keep("manoeuvres", _bars("", "samples", description.manoeuvres))
     return paths
-
-
-def _histogram_figure(histogram: Histogram, *, logarithmic: bool):
-    figure, axes = _axes()
-    wide = histogram.edges[::8] if not logarithmic else np.append(0.0, histogram.edges[1::8])
-    counts = np.add.reduceat(histogram.counts, np.searchsorted(histogram.edges, wide[:-1]))
-    share = 100 * counts / max(counts.sum(), 1)
-    if logarithmic:  # the first bin, without any force, has no place on the axis: the title states it
-        wide, none, share = wide[1:], share[0], share[1:]
-        axes.set_xscale("log")
-        axes.set_title(f"below {1e3 * wide[0]:g} mN in {none:.1f} % of the samples", fontsize=10)
-    axes.bar(wide[:-1], share, width=np.diff(wide), align="edge", color=_COLOUR)
-    for text, value in histogram.quantiles().items():
-        if wide[0] <= value <= wide[-1] and text in ("median", "p95"):
-            axes.axvline(
-                value, color="#333333", lw=1, ls="-" if text == "median" else "--", label=f"{text} {value:.3g}"
-            )
-    axes.legend(frameon=False)
-    axes.set_xlabel(f"{histogram.title}, {histogram.unit}".rstrip(", "))
-    axes.set_ylabel("samples, %")
-    return figure
-
-
-def _bars(label: str, of: str, shares: dict[str, float]):
-    figure, axes = _axes()
-    bars = axes.bar(list(shares), [100 * share for share in shares.values()], color=_COLOUR)
-    axes.bar_label(bars, fmt="%.1f")
-    axes.set_xlabel(label)
-    axes.set_ylabel(f"{of}, %")
-    return figure
-
-
-_COLOUR = "#0072B2"
-
-
-def _axes():
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0, 3.4), layout="constrained")
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes

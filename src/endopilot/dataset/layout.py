@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Shaped
@@ -51,7 +51,14 @@ def assign_splits(
     by_anatomy[order] = np.repeat(np.array(["train", "calibrate", "test"]), counts)
 
     splits = np.repeat(by_anatomy[:, None], n_sequences, axis=1)
-    held_out = _held_out(n_sequences, seen_test_share) if counts[0] else 0
+    held_out = 0
+    if counts[0] and seen_test_share:
+        if n_sequences < 2:
+            raise InputError(
+                f"sequences: {n_sequences} cannot be split into train and seen_test; "
+                "give at least 2 or set seen_test_share to 0"
+            )
+        held_out = min(max(round(n_sequences * seen_test_share), 1), n_sequences - 1)
     for row, name in enumerate(names):
         if by_anatomy[row] == "train":
             ranked = sorted(range(n_sequences), key=lambda i: _digest(f"{name}/{i}"))
@@ -74,18 +81,6 @@ def _counts(n: int, shares: tuple[float, float, float]) -> list[int]:
     return counts
 
 
-def _held_out(n_sequences: int, share: float) -> int:
-    """Return how many of the sequences are held out: the rounded share, but at least one, and never all."""
-    if share == 0:
-        return 0
-    if n_sequences < 2:
-        raise InputError(
-            f"sequences: {n_sequences} cannot be split into train and seen_test; "
-            "give at least 2 or set seen_test_share to 0"
-        )
-    return min(max(round(n_sequences * share), 1), n_sequences - 1)
-
-
 def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
@@ -93,54 +88,56 @@ def _digest(text: str) -> bytes:
 FORMAT_VERSION = 7  # counts changes of the columns or of their meaning
 
 
+class Patient(NamedTuple):
+    """An anatomy of a data set: its folder, name, SHA-256 of what a simulation depends on, and how it moves."""
+
+    folder: Path
+    name: str
+    identity: str
+    motion: Motion | None
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster, with the SHA-256
-    of what the simulation depends on in the anatomy, the navigations' indices, and the first one's in the dataset."""
+    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster, with the
+    navigations' indices, the first one's in the dataset, and their splits."""
 
     number: int
-    folder: Path
-    anatomy: str
-    identity: str
+    patient: Patient
     sequences: range
     first_episode: int
     splits: Shaped[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, eq=False)
-class BlockContext:
-    """What all blocks share: the `key` of this dataset's files, from all settings, LeRobot's `task`, the robot, None
-    where motions are made as drawn, and the world (its stack and anatomies are as given)."""
+class Layout:
+    """Which navigations of which anatomies a dataset holds. A resumed run must share its `settings`, from which the
+    `key` of its files follows; `task` is LeRobot's, the robot None where motions are made as drawn, and devices and
+    anatomies are as given, whatever the world is."""
 
     output: Path
     config: DatasetConfig
     stack: Stack
-    key: str
-    task: str = schema.TASK
-    robot: RobotConfig | None = None
-    world: World = field(default_factory=World)
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Which navigations of which anatomies a dataset holds, and their motion; a resumed run must share its settings."""
-
-    context: BlockContext
-    folders: tuple[Path, ...]
-    names: tuple[str, ...]
-    identities: tuple[str, ...]
+    task: str
+    robot: RobotConfig | None
+    world: World
+    patients: tuple[Patient, ...]
     splits: Shaped[np.ndarray, "anatomies sequences"]
-    motions: tuple[Motion | None, ...]
     settings: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """What marks all files of this dataset."""
+        return hashlib.sha256(json_text(self.settings).encode()).hexdigest()
 
     def blocks(self) -> list[Block]:
         """Return the blocks in the order of their files."""
-        n, size, blocks = self.context.config.sequences, self.context.config.sequences_per_file, []
-        for row, (folder, name, identity) in enumerate(zip(self.folders, self.names, self.identities, strict=True)):
+        n, size, blocks = self.config.sequences, self.config.sequences_per_file, []
+        for row, patient in enumerate(self.patients):
             for first in range(0, n, size):
                 chosen = range(first, min(first + size, n))
                 splits = self.splits[row, chosen.start : chosen.stop]
-                blocks.append(Block(len(blocks), folder, name, identity, chosen, row * n + first, splits))
+                blocks.append(Block(len(blocks), patient, chosen, row * n + first, splits))
         return blocks
 
 
@@ -190,10 +187,9 @@ def make_layout(
         **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
-    key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, stack, key, task, robot, world)
-    motions = tuple(world.motion or patient_motion(config, name) for name in names)
-    return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
+    motions = (world.motion or patient_motion(config, name) for name in names)
+    patients = tuple(map(Patient, map(Path, folders), names, identities, motions))
+    return Layout(Path(output), config, stack, task, robot, world, patients, splits, settings)
 
 
 def version() -> str:

@@ -238,42 +238,23 @@ def read_dataset(folder: str | Path) -> Dataset:
 
 
 def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Dataset:
-    from endopilot.dataset.parquet import column_values, read_table
+    from endopilot.dataset.parquet import column_values, read_tables
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
     columns = schema.signals_in(info["features"])
     devices, by_robot = int(info["features"]["branch"]["shape"][0]), "encoders" in columns
-    episodes: dict[str, list[np.ndarray]] = {}
-    signal: dict[str, np.ndarray] = {}
-    filled = 0
-    for number in range(manifest["files"]):
-        data_path, episodes_path = schema.paths_of_file(folder, number)
-        table = read_table(episodes_path, manifest["key"])
-        for name in table.column_names:
-            episodes.setdefault(name, []).append(column_values(table, name))
-        data = read_table(data_path, manifest["key"])
-        if data.num_rows != table.num_rows * samples:
-            raise InputError(
-                f"{data_path}: {data.num_rows} rows where {table.num_rows * samples} belong; "
-                "delete it and run `endopilot dataset` again"
-            )
-        end = filled + table.num_rows
-        if end > total:
-            break
-        for name in columns:
-            values = column_values(data, name)
-            values = values.reshape(table.num_rows, samples, *values.shape[1:])
-            if name not in signal:  # in place, so that a large dataset is never held twice
-                signal[name] = np.empty((total, *values.shape[1:]), dtype=values.dtype)
-            signal[name][filled:end] = values
-        filled = end
-
-    episode = {name: np.concatenate(parts) for name, parts in episodes.items()}
-    if len(episode["episode_index"]) != total:
+    paths = [schema.paths_of_file(folder, number) for number in range(manifest["files"])]
+    data, table = (read_tables([pair[kind] for pair in paths], manifest["key"]) for kind in (0, 1))
+    if (data.num_rows, table.num_rows) != (total * samples, total):
         raise InputError(
-            f"{folder}: {len(episode['episode_index'])} episodes where {schema.INFO_PATH} counts {total}; "
-            "run `endopilot dataset` again"
+            f"{folder}: {table.num_rows} episodes and {data.num_rows} samples where {schema.INFO_PATH} counts {total} "
+            f"and {total * samples}; run `endopilot dataset` again"
         )
+    episode = {name: column_values(table, name) for name in table.column_names}
+    signal: dict[str, np.ndarray] = {}
+    for name in columns:  # each is let go as it is taken, so that a large dataset is never held twice
+        values = np.array(column_values(data, name))
+        signal[name], data = values.reshape(total, samples, *values.shape[1:]), data.drop_columns(name)
     shape = (total, samples, devices)
     vectors = {name: signal[name].reshape(*shape, -1) for name in ("action", "velocity") if name in signal}
     recorded = {name: _of_signal(name, signal[column], devices) for column, (name, *_) in schema.OWN_COLUMNS.items()}

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.devices.robot import RobotConfig
@@ -26,7 +27,6 @@ from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
@@ -160,7 +160,10 @@ def simulate_navigations(
     stopped = np.zeros(len(control), dtype=bool)
     inserted = simulator.inserted_length
     last, slip = np.zeros_like(inserted), np.zeros_like(inserted)
-    robots = None if robot is None else _Driven(simulator, robot, anatomy, stacks, seeds, ostium_mm)
+    robots, measured = None, []
+    if robot is not None:
+        limits = [[DriveLimits.of(device, anatomy) for device in stack.devices] for stack in stacks]
+        robots = Robots(simulator, robot, limits, seeds=seeds, ostium_mm=ostium_mm)
     for sample in range(control.shape[1]):
         drawn = control[:, sample, :, 0]
         caught = (slip > 0) | (simulator.base_load[..., 0] > watch.caught_n)
@@ -172,55 +175,29 @@ def simulate_navigations(
             held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)
         stopped |= ((drawn > 0) & (held < drawn)).any(axis=1)
         commanded = np.stack([held, control[:, sample, :, 1]], axis=-1).astype(np.float32)
-        step = recorder.step(commanded) if robots is None else robots.step(commanded, recorder)
+        if robots is None:
+            step = recorder.step(commanded)
+        else:
+            robots.motion.command(commanded.astype(float))
+            step = recorder.step(robots.advance(SAMPLE_PERIOD_S))
+            robots.follow(simulator)
+            measured.append(np.concatenate([commanded, robots.read(simulator)], axis=-1))
         slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
     trajectory = recorder.trajectory()
-    return trajectory if robots is None else replace(trajectory, columns=robots.columns), stopped
-
-
-class _Driven:
-    """The robots of the worlds, and what they were commanded and have measured at each sample."""
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        config: RobotConfig,
-        anatomy: Anatomy,
-        stacks: Sequence[Stack],
-        seeds: Sequence[Sequence[int]],
-        ostium_mm: float,
-    ) -> None:
-        limits = [[DriveLimits.of(device, anatomy) for device in stack.devices] for stack in stacks]
-        self._robots = Robots(simulator, config, limits, seeds=seeds, ostium_mm=ostium_mm)
-        self._rows: list[Float[np.ndarray, "worlds devices 6"]] = []
-
-    def step(self, commanded: Float[np.ndarray, "worlds devices 2"], recorder: Recorder) -> Step:
-        self._robots.motion.command(commanded.astype(float))
-        step = recorder.step(self._robots.advance(recorder.period_s))
-        self._robots.follow(recorder.simulator)
-        self._rows.append(np.concatenate([commanded, self._robots.read(recorder.simulator)], axis=-1))
-        return step
-
-    @property
-    def columns(self) -> dict[str, Float[np.ndarray, "worlds samples devices 2"]]:
-        decided, encoders, load = np.split(np.stack(self._rows, axis=1), 3, axis=-1)
-        return {"decided": decided, "encoders": encoders, "load": load}
-
-
-def branch_ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
-    """Return the abscissa at which every branch ends, mm; infinite where it goes on."""
-    ends = np.full(len(tree.branches), np.inf)
-    for leaf in tree.leaves():
-        ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
-    return ends
+    if measured:
+        columns = np.split(np.stack(measured, axis=1), 3, axis=-1)
+        trajectory = replace(trajectory, columns=dict(zip(OF_ROBOT, columns, strict=True)))
+    return trajectory, stopped
 
 
 class _PushRoom:
     """How far each device (columns) may still be pushed in each world; over `caught_n` of push, N, it is caught."""
 
     def __init__(self, tree: VesselTree, stacks: Sequence[Stack]) -> None:
-        self._ends = branch_ends(tree)
+        self._ends = np.full(len(tree.branches), np.inf)  # of branches that go on
+        for leaf in tree.leaves():
+            self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
         self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
         self.caught_n = CAUGHT * np.array([[device.push_limit_n for device in stack.devices] for stack in stacks])
         self._limit = np.full(self.caught_n.shape, np.inf)

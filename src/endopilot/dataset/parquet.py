@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,11 @@ def read_table(path: Path, key: str) -> pa.Table:
             "delete it and run `endopilot dataset` again"
         )
     return table
+
+
+def read_tables(paths: Sequence[Path], key: str) -> pa.Table:
+    """Read Parquet files of one dataset as one table."""
+    return pa.concat_tables([read_table(path, key) for path in paths])
 
 
 def column_values(table: pa.Table, name: str) -> np.ndarray:

@@ -24,6 +24,7 @@ INFO_PATH = "meta/info.json"
 STATS_PATH = "meta/stats.json"
 TASKS_PATH = "meta/tasks.parquet"
 MANIFEST_PATH = "meta/manifest.json"
+DESCRIPTION = (INFO_PATH, STATS_PATH, TASKS_PATH, MANIFEST_PATH)  # in the order in which they are written
 TASK = "random navigation"
 
 INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")  # LeRobot's; with `timestamp`, s, float32

@@ -17,8 +17,8 @@ from jaxtyping import Bool
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
-from endopilot.dataset.layout import Block, BlockContext, version
-from endopilot.dataset.navigations import Draw, draw_navigations, patient_motion, simulate_navigations
+from endopilot.dataset.layout import Block, Layout, version
+from endopilot.dataset.navigations import Draw, draw_navigations, simulate_navigations
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError
 from endopilot.files import writing
@@ -28,12 +28,12 @@ from endopilot.types import Anatomy
 
 
 def write_block(
-    context: BlockContext, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
+    layout: Layout, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> None:
     """Simulate one block and write it; `advance` is called with the numbers of samples simulated."""
-    config, anatomy, stack = context.config, _read(block.folder, block.identity), context.stack
+    config, anatomy, stack = layout.config, _read(block.patient.folder, block.patient.identity), layout.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
-    world = context.world.leaning(config.seed)
+    world = layout.world.leaning(config.seed)
     stacks = draw.stacks(stack)
     true = {id(each): world.stack(each) for each in stacks}
     friction = world.stack(stack).frictions(draw.friction * world.friction_factor)
@@ -47,23 +47,23 @@ def write_block(
             friction,
             replace(world.core(config.simulator), threads=threads),
             actuation=config.control,
-            motion=world.motion or patient_motion(config, anatomy.name),
-            robot=context.robot,
+            motion=block.patient.motion,
+            robot=layout.robot,
             ostium_mm=world.ostium_mm,
             seeds=draw.seeds,
             advance=advance,
         )
-    store_block(context, block, draw, trajectory, stopped)
+    store_block(layout, block, draw, trajectory, stopped)
 
 
 def store_block(
-    context: BlockContext, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
+    layout: Layout, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
 ) -> None:
     """Write a block's navigations, one world each: their episodes, then their samples, which mark both as complete."""
-    data_path, episodes_path = schema.paths_of_file(context.output, block.number)
-    samples = parquet.sample_table(trajectory, block.first_episode, context.key)
+    data_path, episodes_path = schema.paths_of_file(layout.output, block.number)
+    samples = parquet.sample_table(trajectory, block.first_episode, layout.key)
     for path, table in (
-        (episodes_path, parquet.marked_table(_episodes(context, block, draw, trajectory, stopped), context.key)),
+        (episodes_path, parquet.marked_table(_episodes(layout, block, draw, trajectory, stopped), layout.key)),
         (data_path, samples),
     ):
         with writing(path) as partial:
@@ -80,7 +80,7 @@ def _read(folder: Path, identity: str) -> Anatomy:
 
 
 def _episodes(
-    context: BlockContext, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
+    layout: Layout, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
 ) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = trajectory.valid.shape
@@ -90,17 +90,17 @@ def _episodes(
     chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
     return {
         "episode_index": episode,
-        "tasks": [[context.task]] * n,
+        "tasks": [[layout.task]] * n,
         "length": np.full(n, samples),
         "dataset_from_index": episode * samples,
         "dataset_to_index": (episode + 1) * samples,
         "data/chunk_index": np.full(n, chunk),
         "data/file_index": np.full(n, file),
-        "anatomy": [block.anatomy] * n,
-        "anatomy_sha256": [block.identity] * n,
+        "anatomy": [block.patient.name] * n,
+        "anatomy_sha256": [block.patient.identity] * n,
         "sequence": np.array(block.sequences),
         "split": block.splits.tolist(),
-        "device": [context.stack.wire.name] * n,
+        "device": [layout.stack.wire.name] * n,
         "tip_bend_rad": draw.tip_bend_rad,
         "tip_stiffness_factor": draw.tip_stiffness_factor,
         **{f"{prefix}friction": set_up.friction[:, k] for k, prefix in enumerate(prefixes)},
@@ -109,7 +109,7 @@ def _episodes(
             for k, prefix in enumerate(prefixes)
             for axis, name in enumerate(("inserted_length_mm", "rotation_rad"))
         },
-        **{f"catheter_{k + 1}": [each.name] * n for k, each in enumerate(context.stack.catheters)},
+        **{f"catheter_{k + 1}": [each.name] * n for k, each in enumerate(layout.stack.catheters)},
         "stopped_short": stopped,
         "valid": whole,
         "invalid_reason": ["" if valid else trajectory.why_invalid(world) for world, valid in enumerate(whole)],
@@ -127,9 +127,9 @@ class _Interrupted(Exception):
     """Ends the threads of an interrupted or failed run."""
 
 
-def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
+def run_locally(layout: Layout, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
     """Write blocks with one thread each, one a core at a time; of fewer blocks the rod core uses the other cores."""
-    cores = context.config.simulator.threads or CORES
+    cores = layout.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
     threads = cores // workers
     stop = threading.Event()
@@ -141,7 +141,7 @@ def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, adva
 
     started = time.process_time()
     with ThreadPoolExecutor(workers) as pool:
-        futures = {pool.submit(write_block, context, b, threads=threads, advance=report): b for b in blocks}
+        futures = {pool.submit(write_block, layout, b, threads=threads, advance=report): b for b in blocks}
         try:
             for future in as_completed(futures):
                 future.result()
@@ -197,8 +197,8 @@ def _check_versions(client, scheduler: str) -> None:
             raise InputError(f"scheduler: worker {worker} has {other}, here is {version()}; install the same")
 
 
-def write_timed(context: BlockContext, block: Block) -> float:
+def write_timed(layout: Layout, block: Block) -> float:
     """Write a block and return the processor time that it took, s."""
     started = time.process_time()
-    write_block(context, block)
+    write_block(layout, block)
     return time.process_time() - started

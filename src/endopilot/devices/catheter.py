@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced, Wire, WireFile, check_built, file_constants
+from endopilot.devices.device import Device, Sourced, TipShaping, Wire, WireFile, check_built, file_constants
 from endopilot.devices.device_files import (
     MOST_VALUES,
     Abscissa,
@@ -136,34 +136,26 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
 
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
     """Write a device as a YAML file that `read_wire` or `read_catheter` reads back; InputError if it cannot."""
-    content = _wire(device) if isinstance(device, Wire) else _catheter(device)
+    content: dict[str, Any] = {"name": device.name}
+    for each in fields(WireFile if isinstance(device, Wire) else CatheterFile):
+        value = _written(device, each.name)
+        if each.name != "name" and value is not None:
+            content[each.name] = value | {"source": device.sources[each.name]}
     write_yaml(Path(output), content)
 
 
-def _wire(wire: Wire) -> dict[str, Any]:
-    content = _sourced(wire, WireFile, but=("tip_bend", "tip_shaping"))
-    angle_deg = round(math.degrees(wire.tip_bend_rad), 10)
-    if math.radians(angle_deg) != wire.tip_bend_rad:
-        angle_deg = math.degrees(wire.tip_bend_rad)
-    source = wire.sources["tip_bend"]
-    content["tip_bend"] = {"angle_deg": angle_deg, "length_mm": wire.tip_bend_length_mm, "source": source}
-    shaping = wire.tip_shaping
-    if shaping is not None:
-        limits = {"angle_deg": list(shaping.angle_deg), "length_mm": list(shaping.length_mm)}
-        content["tip_shaping"] = limits | {"source": wire.sources["tip_shaping"]}
-    return content
-
-
-def _catheter(catheter: Catheter) -> dict[str, Any]:
-    arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
-    shape = {"arcs": arcs, "source": catheter.sources["shape"]}
-    return _sourced(catheter, CatheterFile, but=("shape",)) | {"shape": shape}
-
-
-def _sourced(device: Wire | Catheter, file: type, *, but: tuple[str, ...]) -> dict[str, Any]:
-    """Return name and constants as a file has them, each with its source, but for those of other form."""
-    content: dict[str, Any] = {"name": device.name}
-    for name in (field.name for field in fields(file) if field.name not in ("name", *but)):
-        value = getattr(device, name)
-        content[name] = {"value": list(value) if isinstance(value, tuple) else value, "source": device.sources[name]}
-    return content
+def _written(device: Wire | Catheter, name: str) -> dict[str, Any] | None:
+    """Return what a file holds of a constant, but for its source; None where the device has none such."""
+    if name == "shape":
+        assert isinstance(device, Catheter)
+        return {"arcs": [[length, round(math.degrees(angle), 10)] for length, angle in device.shape]}
+    if name == "tip_bend":
+        assert isinstance(device, Wire)
+        angle_deg = round(math.degrees(device.tip_bend_rad), 10)
+        exact = math.radians(angle_deg) == device.tip_bend_rad
+        angle_deg = angle_deg if exact else math.degrees(device.tip_bend_rad)
+        return {"angle_deg": angle_deg, "length_mm": device.tip_bend_length_mm}
+    value = getattr(device, name)
+    if isinstance(value, TipShaping):
+        return {"angle_deg": list(value.angle_deg), "length_mm": list(value.length_mm)}
+    return None if name == "tip_shaping" else {"value": list(value) if isinstance(value, tuple) else value}

@@ -34,7 +34,7 @@ from endopilot.devices.device_files import (
     device_file,
 )
 from endopilot.errors import InputError
-from endopilot.settings import NonNegative, Positive, Text, Within, public, read_settings, settings
+from endopilot.settings import Ascending, NonNegative, Positive, Text, Within, public, read_settings, settings
 from endopilot.types import Anatomy
 
 Value = TypeVar("Value")
@@ -55,16 +55,8 @@ _LEAST_DEG = math.degrees(math.pi) / 57  # a bend up to this, some 3.16 °, is o
 class TipShaping:
     """The bends that a hand can give a wire's tip: least and largest angle (degrees) and length from the tip (mm)."""
 
-    angle_deg: tuple[NonNegative, NonNegative]
-    length_mm: tuple[Positive, Positive]
-
-    @model_validator(mode="after")
-    def _consistent(self) -> TipShaping:
-        for name in ("angle_deg", "length_mm"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f"{name}: [{low:g}, {high:g}]; give the least first")
-        return self
+    angle_deg: Annotated[tuple[NonNegative, NonNegative], Ascending]
+    length_mm: Annotated[tuple[Positive, Positive], Ascending]
 
     def allows(self, angle_deg: float, length_mm: float) -> bool:
         """Return whether a hand can bend the tip by an angle (degrees) over a length (mm)."""
@@ -225,8 +217,8 @@ class _TipBend:
 class _Shaping(TipShaping):
     """The bends that a hand can give the tip, in a device's file, and where their limits come from."""
 
-    angle_deg: tuple[Angle, Angle]
-    length_mm: tuple[ArcLength, ArcLength]
+    angle_deg: Annotated[tuple[Angle, Angle], Ascending]
+    length_mm: Annotated[tuple[ArcLength, ArcLength], Ascending]
     source: Text
 
 

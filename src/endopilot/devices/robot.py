@@ -66,14 +66,13 @@ class DriveConfig:
 
     def gripped(self, device: Kind) -> Kind:
         """Return a device with the limits at which it slips in this drive."""
-        push, pull, torque = device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm
-        if self.grip_n is not None:
-            push, pull = min(push, self.grip_n), min(pull, self.grip_n)
-        if self.grip_n_mm is not None:
-            torque = min(torque, self.grip_n_mm)
-        if (push, pull, torque) == (device.push_limit_n, device.pull_limit_n, device.torque_limit_n_mm):
-            return device
-        return replace(device, push_limit_n=push, pull_limit_n=pull, torque_limit_n_mm=torque)
+        force, torque = self.grip_n or np.inf, self.grip_n_mm or np.inf
+        return replace(
+            device,
+            push_limit_n=min(device.push_limit_n, force),
+            pull_limit_n=min(device.pull_limit_n, force),
+            torque_limit_n_mm=min(device.torque_limit_n_mm, torque),
+        )
 
 
 @settings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -45,19 +46,16 @@ def run_core(
     control: Float[np.ndarray, "worlds samples numbers"],
     friction: Float[np.ndarray, "worlds *devices"],
     actuation: Actuation = "velocity",
-    loads: _core.Loads | None = None,
     record_shape: bool = False,
     record_attitude: bool = False,
     lanes: int = LANES,
-    approach: bool = True,
-    free_behind_mm: float = FREE_BEHIND_MM,
     push_limit_n: float = np.inf,
     pull_limit_n: float = np.inf,
     torque_limit_n_mm: float = np.inf,
     tubes: TubeLayout | None = None,
-    transmission: TransmissionLayout | None = None,
+    **made_of: Any,
 ) -> dict[str, np.ndarray]:
-    """Run the C++ core on rods and walls of one's own making; arguments are those of `make_simulation`.
+    """Run the C++ core on rods and walls of one's own making; `made_of` is what else `make_simulation` takes.
 
     Args:
         initial: inserted length (mm) and rotation (rad) of each device before the first period.
@@ -81,10 +79,7 @@ def run_core(
         worlds=worlds,
         config=config,
         tubes=tubes,
-        transmission=transmission,
-        loads=loads,
-        approach=approach,
-        free_behind_mm=free_behind_mm,
+        **made_of,
     )
     simulation.reset(
         index=np.arange(worlds),

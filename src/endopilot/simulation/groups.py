@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from endopilot.anatomy.tree import tangents
 from endopilot.devices.drive_limits import far_end_mm
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_distance_map, check_memory
-from endopilot.simulation.config import FREE_BEHIND_MM, CoreMotion, Lumen, Simulation, SimulatorConfig, core_for
+from endopilot.simulation.config import FREE_BEHIND_MM, CoreMotion, Lumen, Simulation, SimulatorConfig
 from endopilot.simulation.core import make_lumen, make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
@@ -33,6 +34,7 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
     """Return an anatomy's wall as the core wants it for a stack. A spline rounds the distance's ridge on the axis by up
     to half the map's spacing; for catheters hardly narrower than the vessel its grid is finer, and the inscribed
     spheres make it sharp."""
+    check_distance_map(anatomy)
     radius_mm = stack.outer_radius_mm
     varies = config.wall_along or config.wall_around
     field = _stiffened(anatomy, radius_mm, config) if varies else anatomy.distance_map
@@ -111,7 +113,7 @@ class Group:
     """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        wall: how far outside the wall the lumen goes, mm, and how its stiffness varies along the vessel and around.
+        wall: what the lumen was made of, so that others of the same share it.
         motion: of the vessel, None if it lies still; as the core has it, as are `lumen` and `simulation`.
         index: the worlds' numbers, ascending.
         path_mm: length of the vessel's longest path; `longest_mm`: inserted length that the wire is laid out for.
@@ -135,27 +137,13 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
     return anatomy.identity, stack.constants
 
 
-def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
-    return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
-
-
-def _varies(config: SimulatorConfig) -> tuple[Any, ...]:
-    return config.wall_reach_mm, config.wall_along, config.wall_around
-
-
-def _wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
-    """Return a vessel's wall, as it was made where it is one of the last few: that takes longer than a short run."""
-
-    def make() -> Lumen:
-        check_distance_map(anatomy)
-        return make_wall(anatomy, stack, config)
-
-    key = (*_wall_key(anatomy, stack), *_varies(config), config.processor)
-    return kept(key, make)
+def _wall_key(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> tuple[Any, ...]:
+    of_config = config.wall_reach_mm, config.wall_along, config.wall_around, config.processor
+    return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters), *of_config
 
 
 def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-    """Return a wall of this key, as it was made where it is one of the last few."""
+    """Return a wall of this key, as it was made where it is one of the last few: that takes longer than a short run."""
     wall = _walls.pop(key, None)
     _walls[key] = wall = make() if wall is None else wall
     while len(_walls) > _KEPT:
@@ -174,9 +162,7 @@ def make_groups(
     """Return the groups of worlds, with wires laid out (`reach_mm`, or to the vessel's far end if deeper) at the
     ostium, about which vessels move by `motion`; `sharing`'s lumens are taken over. Raises InputError as `Simulator`.
     """
-    core, wall = core_for(config.processor), _varies(config)
-    prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen) and group.wall == wall]
-    lumens = {_wall_key(group.anatomy, group.stack): group.lumen for group in prepared}
+    lumens = {group.wall: group.lumen for group in sharing}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
     for world, pair in enumerate(zip(anatomies, stacks, strict=True)):
@@ -185,9 +171,9 @@ def make_groups(
     for worlds in members.values():
         anatomy, stack = anatomies[worlds[0]], stacks[worlds[0]]
         stack.check(anatomy)
-        key = _wall_key(anatomy, stack)
+        key = _wall_key(anatomy, stack, config)
         if key not in lumens:
-            lumens[key] = _wall(anatomy, stack, config)
+            lumens[key] = kept(key, partial(make_wall, anatomy, stack, config))
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
@@ -210,5 +196,5 @@ def make_groups(
             transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
         where = (np.array(worlds), path_mm, longest_mm, projectors[anatomy.identity])
-        groups.append(Group(anatomy, stack, rod, lumens[key], wall, moving, simulation, *where))
+        groups.append(Group(anatomy, stack, rod, lumens[key], key, moving, simulation, *where))
     return groups

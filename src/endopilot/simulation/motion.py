@@ -110,35 +110,28 @@ def contracted_share(phase: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return course(np.mod(phase, 1.0))
 
 
+_STILL: dict[str, tuple[str, ...]] = {
+    "breathing": ("annulus_mm", "heart_volume_share", "heart_rotation_deg"),
+    "heartbeat": tuple(name for name in AMPLITUDES if name.startswith("breathing")),
+    "both": (),
+}
+"""What does not move in motions, by their names."""
+
+
 def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
     """Return a motion by its name; None for "still". The seed draws one patient's amplitudes from the published
     distributions, within the published ranges; without it they are the published means."""
     if name == "still":
         return None
-    motion = Motion() if seed is None else draw_motion(seed)
-    if name == "breathing":
-        return replace(motion, annulus_mm=0.0, heart_volume_share=0.0, heart_rotation_deg=0.0)
-    if name == "heartbeat":
-        return replace(
-            motion,
-            breathing_caudal_mm=0.0,
-            breathing_anterior_mm=0.0,
-            breathing_dorsal_deg=0.0,
-            breathing_dextral_deg=0.0,
-        )
-    return motion
+    return replace(Motion() if seed is None else draw_motion(seed), **dict.fromkeys(_STILL[name], 0.0))
 
 
 def published_mean(motion: Motion) -> Motion | None:
     """Return published mean amplitudes of what moves in a patient's motion, with the patient's periods, or None."""
-    beats = bool(motion.annulus_mm or motion.heart_volume_share or motion.heart_rotation_deg)
-    shifts = motion.breathing_caudal_mm or motion.breathing_anterior_mm
-    breathes = bool(shifts or motion.breathing_dorsal_deg or motion.breathing_dextral_deg)
-    name: MotionName = ("both" if breathes else "heartbeat") if beats else ("breathing" if breathes else "still")
-    mean = motion_named(name)
-    if mean is None:
-        return None
-    return replace(mean, heart_period_s=motion.heart_period_s, breathing_period_s=motion.breathing_period_s)
+    beats, breathes = (any(getattr(motion, each) for each in _STILL[name]) for name in ("breathing", "heartbeat"))
+    still = dict.fromkeys((() if beats else _STILL["breathing"]) + (() if breathes else _STILL["heartbeat"]), 0.0)
+    periods = {"heart_period_s": motion.heart_period_s, "breathing_period_s": motion.breathing_period_s}
+    return replace(Motion(), **still, **periods) if beats or breathes else None
 
 
 def draw_motion(seed: int) -> Motion:

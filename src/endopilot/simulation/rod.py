@@ -69,9 +69,6 @@ def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
     abscissa = _nodes(element_mm, length_mm, device.tip_bend_length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])
     middle = abscissa + 0.5 * length
-    # A round section of the device's diameter ties EA and kGA to EI: EA = 16 EI / d², with EI that of the element.
-    stretch = 16.0 * device.bend_stiffness(middle) / device.diameter_mm**2
-    shear = SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO))
     # A joint stands for the stretch between the middles of its elements: the bend that falls there is its own. That
     # ahead of the first joint is dropped: the first element's direction is that of the wire at its middle.
     ends = np.minimum(middle, device.tip_bend_length_mm)
@@ -81,16 +78,31 @@ def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
         curvature[1:, 0] = bent / np.diff(middle)
     softness = min(1.0, min(device.bend_stiffness_n_mm2) / _SOFT_N_MM2)
     drag = max(_DRAG_N_S_MM2 * softness**2, _LEAST_N_S_MM2)
+    spin_drag = drag * device.tip_radius_mm**2 * length  # of the surface, radius times rotation
+    return rod_at(device, abscissa, middle, curvature, drag * length, spin_drag)
+
+
+def rod_at(
+    device: Wire,
+    abscissa_mm: Float[np.ndarray, "n"],
+    middle_mm: Float[np.ndarray, "n"],
+    rest_curvature: Float[np.ndarray, "n 3"],
+    drag_n_s_mm: Float[np.ndarray, "n"],
+    spin_drag_n_mm_s: Float[np.ndarray, "n"],
+) -> RodLayout:
+    """Return a device as a rod with these nodes and middles of elements. A round section of the device's diameter ties
+    EA and kGA to EI: EA = 16 EI / d², with EI that of the element."""
+    stretch = 16.0 * device.bend_stiffness(middle_mm) / device.diameter_mm**2
     return RodLayout(
-        abscissa_mm=abscissa,
-        shear_n=shear,
+        abscissa_mm=abscissa_mm,
+        shear_n=SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO)),
         stretch_n=stretch,
-        bend_n_mm2=device.bend_stiffness(abscissa),
-        twist_n_mm2=device.twist_stiffness(abscissa),
-        rest_curvature=curvature,
-        radius_mm=np.full(len(abscissa), device.tip_radius_mm),
-        drag_n_s_mm=drag * length,
-        spin_drag_n_mm_s=drag * device.tip_radius_mm**2 * length,  # of the surface, radius times rotation
+        bend_n_mm2=device.bend_stiffness(abscissa_mm),
+        twist_n_mm2=device.twist_stiffness(abscissa_mm),
+        rest_curvature=rest_curvature,
+        radius_mm=np.full(len(abscissa_mm), device.tip_radius_mm),
+        drag_n_s_mm=drag_n_s_mm,
+        spin_drag_n_mm_s=spin_drag_n_mm_s,
     )
 
 

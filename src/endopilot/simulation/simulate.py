@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
@@ -31,15 +30,6 @@ or cerebral artery."""
 
 
 LONGEST_MM = 5000.0  # no wire or catheter is longer, mm: exchange wires have up to 4.5 m
-
-
-@dataclass(frozen=True)
-class WallForceEvent:
-    """A world that presses the wall beyond `WALL_FORCE_LIMIT_N`, the end of its first such sample, s, and its peak."""
-
-    world: int
-    time_s: float
-    force_n: float
 
 
 @public
@@ -147,28 +137,23 @@ def run_set_up(
         return simulator.run(command, period_s=period_s, record_shape=record_shape, advance=advance)
 
 
-def wall_force_events(trajectory: Trajectory) -> tuple[WallForceEvent, ...]:
-    """Return by their numbers the valid worlds whose wire presses the wall harder than it should."""
-    force = np.where(trajectory.valid, trajectory.wall_force, 0.0)
-    above = force > WALL_FORCE_LIMIT_N
-    return tuple(
-        WallForceEvent(world, trajectory.period_s * (int(np.argmax(above[world])) + 1), float(force[world].max()))
-        for world in np.flatnonzero(above.any(axis=1)).tolist()
-    )
+def wall_force_worlds(trajectory: Trajectory) -> Int[np.ndarray, "pressing"]:
+    """Return the numbers of the worlds whose wire, while they are valid, presses the wall harder than it should."""
+    return np.flatnonzero((trajectory.valid & (trajectory.wall_force > WALL_FORCE_LIMIT_N)).any(axis=1))
 
 
 def _report(trajectory: Trajectory) -> None:
     notes, worlds = [], len(trajectory.valid)
-    bad = np.flatnonzero(trajectory.reason)
+    bad, pressing = np.flatnonzero(trajectory.reason), wall_force_worlds(trajectory)
     if len(bad):
         first = int(bad[0])
         notes.append(f"{len(bad)} of {worlds} worlds are invalid; world {first} {trajectory.why_invalid(first)}")
-    events = wall_force_events(trajectory)
-    if events:
+    if len(pressing):
+        force = np.where(trajectory.valid, trajectory.wall_force, 0.0)[pressing[0]]
+        time_s = trajectory.period_s * (int(np.argmax(force > WALL_FORCE_LIMIT_N)) + 1)
         notes.append(
-            f"{len(events)} of {worlds} worlds press the wall with more than {WALL_FORCE_LIMIT_N:g} N; world "
-            f"{events[0].world} after {events[0].time_s:g} s, with up to {events[0].force_n:.2f} N"
+            f"{len(pressing)} of {worlds} worlds press the wall with more than {WALL_FORCE_LIMIT_N:g} N; world "
+            f"{pressing[0]} after {time_s:g} s, with up to {force.max():.2f} N"
         )
-    if notes:
-        for note in notes:
-            warnings.warn(note, Remark, stacklevel=3)
+    for note in notes:
+        warnings.warn(note, Remark, stacklevel=3)

@@ -29,11 +29,12 @@ from endopilot.simulation.core_state import run_along
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.readout import Readout
-from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step, SupportsDLPack
+from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
+_STATE_FORMAT = 4  # of `SimulatorState`: raised when its values come to mean something else
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 _AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds, but not the main thread's: Ctrl-C stops a step there
 
@@ -155,7 +156,11 @@ class Simulator(Readout):
             raise InputError(f"worlds: {chosen.max()} or {chosen.min()} is no world; there are {self.worlds}")
         if seed is None and (inserted_length is None or rotation is None):
             raise InputError("seed: none given; give one, or inserted_length and rotation of every world")
-        start, turn = self._random_start(seed)
+        start, turn = np.zeros((2, self.worlds, self._devices))
+        if seed is not None:
+            draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
+            deepest = self._merge([np.full(len(group.index), _DEEPEST_START * group.path_mm) for group in self._groups])
+            start[:, 0], turn[:, 0] = draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
         start = start if inserted_length is None else self._of_devices_given("inserted_length", inserted_length)
         turn = turn if rotation is None else self._of_devices_given("rotation", rotation)
         own = self._own_friction
@@ -190,12 +195,12 @@ class Simulator(Readout):
             friction=np.where(resets[:, None], coefficient, self._set_up.friction),
         )
 
-    def step(self, control: ArrayLike | SupportsDLPack, duration_s: float) -> Step:
+    def step(self, control: ArrayLike, duration_s: float) -> Step:
         """Drive every world for some time with a constant control.
 
         Args:
             control: translation (mm/s) and rotation (rad/s), or axial force (N) and torque (N·mm), of each world and
-                device; numpy, or anything that speaks DLPack, such as a torch tensor on the CPU.
+                device; anything that numpy makes an array of, such as a torch tensor on the CPU.
             duration_s: time that the control holds, s; it is cut into equal time steps of at most `config.time_step_s`.
 
         Returns:
@@ -305,10 +310,9 @@ class Simulator(Readout):
             >>> simulator.set_up.initial.shape
             (4, 1, 2)
         """
-        state.check_version()
         if state.fingerprint != self._fingerprint:
             raise InputError(
-                "state: made with other anatomies, devices or settings; restore it in a simulator like its own"
+                "state: made with other anatomies, devices, settings or version; restore it in a simulator like its own"
             )
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
@@ -359,21 +363,10 @@ class Simulator(Readout):
         """Settings of the rod core."""
         return self._set_up.config
 
-    def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
-        start, turn = np.zeros((2, self.worlds, self._devices))
-        if seed is not None:
-            draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
-            deepest = self._merge([np.full(len(group.index), _DEEPEST_START * group.path_mm) for group in self._groups])
-            start[:, 0], turn[:, 0] = draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
-        return start, turn
-
     def _checked(
-        self, control: ArrayLike | SupportsDLPack, period_s: float, *, sequence: bool
+        self, control: ArrayLike, period_s: float, *, sequence: bool
     ) -> Float[np.ndarray, "worlds samples devices 2"]:
-        array: Any = control
-        if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
-            array = np.from_dlpack(array)
-        array = np.asarray(array, dtype=float)
+        array = np.asarray(control, dtype=float)
         samples = array.shape[1:2] if sequence else ()
         array = with_device_axis("control", array, (self.worlds, *samples, self._devices, 2))
         array = np.ascontiguousarray(array if sequence else array[:, None])
@@ -469,7 +462,7 @@ class Simulator(Readout):
     @cached_property
     def _fingerprint(self) -> str:
         groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
-        return hashlib.sha256(repr((self._settings, groups)).encode()).hexdigest()
+        return hashlib.sha256(repr((_STATE_FORMAT, self._settings, groups)).encode()).hexdigest()
 
     @property
     def _settings(self) -> tuple[Any, ...]:

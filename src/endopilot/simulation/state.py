@@ -1,11 +1,10 @@
-"""What `Simulator` takes and returns: its worlds' set-up, a control array, a step's results and a saved state."""
+"""What `Simulator` takes and returns: its worlds' set-up, a step's results and a saved state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
@@ -18,16 +17,6 @@ from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SolvedOutputs, described
 from endopilot.types import Anatomy
-
-FORMAT_VERSION = 4  # of `SimulatorState`: raised when its values or its fingerprint come to mean something else
-
-
-@runtime_checkable
-class SupportsDLPack(Protocol):
-    """An array of another library that numpy can read without a copy."""
-
-    def __dlpack__(self, **arguments: Any) -> Any: ...
-    def __dlpack_device__(self) -> tuple[int, int]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,38 +61,21 @@ class SimulatorState:
 
     values: tuple[Float[np.ndarray, "_ _"], ...]
     fingerprint: str
-    format_version: int = FORMAT_VERSION
-
-    def check_version(self, where: str = "state") -> None:
-        """Raise InputError, which names `where` it is from, unless this version of endopilot can read the values."""
-        if self.format_version != FORMAT_VERSION:
-            raise InputError(
-                f"{where}: format version {self.format_version}, not {FORMAT_VERSION}; make the state again"
-            )
 
     def write(self, path: Path | str) -> None:
         """Write the state to an .npz file, whole or not at all."""
         arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
         with writing(Path(path)) as temporary, temporary.open("wb") as file:
-            about = {"fingerprint": np.array(self.fingerprint), "format_version": np.array(self.format_version)}
-            np.savez(file, **about, **arrays)  # pyright: ignore[reportArgumentType]
+            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
     def read(path: Path | str) -> SimulatorState:
-        """Read a state; InputError if the file is missing, is no saved state, or is one of another format version."""
+        """Read a state; InputError if the file is missing or is no saved state."""
         try:
             with np.load(regular(path), allow_pickle=False) as stored:
-                fingerprint = str(stored["fingerprint"])
-                version = int(stored["format_version"]) if "format_version" in stored else 0
-                names = sorted((name for name in stored.files if name.startswith("values_")), key=_number)
-                state = SimulatorState(tuple(stored[name] for name in names), fingerprint, version)
+                count = sum(name.startswith("values_") for name in stored.files)
+                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
         except (OSError, ValueError, KeyError, BadZipFile) as error:
             raise InputError(
                 f"{path}: no saved state of a simulator ({error}); write one with SimulatorState.write"
             ) from None
-        state.check_version(str(path))
-        return state
-
-
-def _number(name: str) -> int:
-    return int(name.removeprefix("values_"))

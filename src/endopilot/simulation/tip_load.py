@@ -19,7 +19,7 @@ from endopilot import _core
 from endopilot.devices.device import GRAM_FORCE_N, Wire, read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
-from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
+from endopilot.simulation.rod import rod_at
 from endopilot.types import Insertion
 
 HELD_MM = 10.0  # distance from the tip at which the test holds the wire, mm
@@ -48,8 +48,12 @@ def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
     """Push the distal 10 mm of a wire (or its name, or its YAML file), straight, against a smooth plate until it
     buckles; RuntimeError if the rod core did not converge."""
     wire = wire if isinstance(wire, Wire) else read_wire(wire)
-    rod = _distal_rod(wire)
-    nodes = len(rod.abscissa_mm)
+    size, nodes = (
+        HELD_MM / (_ELEMENTS - 0.5),
+        _ELEMENTS + 1,
+    )  # of the clamped element half is held: it fixes a direction
+    at, drag = size * np.arange(nodes), np.full(nodes, _DRAG)
+    rod = rod_at(wire, at, at + 0.5 * size, np.zeros((nodes, 3)), drag, drag)
     dead, plate, anchor = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3))
     dead[0, 1] = _IMPERFECTION * np.pi**2 * wire.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
     plate[0, 0], anchor[0, 0] = _PLATE_N_MM, HELD_MM
@@ -97,20 +101,3 @@ def tip_load_row(device: Wire) -> dict[str, Any]:
         "bar": TOLERANCE,
         "passed": None if error is None else abs(error) <= TOLERANCE,
     }
-
-
-def _distal_rod(device: Wire) -> RodLayout:
-    size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
-    abscissa = size * np.arange(_ELEMENTS + 1)
-    stretch = 16.0 * device.bend_stiffness(abscissa + 0.5 * size) / device.diameter_mm**2  # a round section, as in rod
-    return RodLayout(
-        abscissa_mm=abscissa,
-        shear_n=SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO)),
-        stretch_n=stretch,
-        bend_n_mm2=device.bend_stiffness(abscissa),
-        twist_n_mm2=device.twist_stiffness(abscissa),
-        rest_curvature=np.zeros((len(abscissa), 3)),
-        radius_mm=np.full(len(abscissa), device.tip_radius_mm),
-        drag_n_s_mm=np.full(len(abscissa), _DRAG),
-        spin_drag_n_mm_s=np.full(len(abscissa), _DRAG),
-    )

@@ -16,7 +16,6 @@ from pydantic_core import PydanticCustomError
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.anatomy.other_lumen import with_radii
 from endopilot.anatomy.tree import cross_axes
-from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.device_files import named_file
 from endopilot.devices.robot import RobotConfig, read_robot
@@ -179,13 +178,10 @@ class World:
             friction=given.friction * self.friction_factor,
         )
 
-    def catheters(self, given: tuple[Catheter, ...]) -> tuple[Catheter, ...]:
-        """Return catheters as they are in reality: their friction on the wall differs as the wire's does."""
-        return tuple(replace(each, friction=each.friction * self.friction_factor) for each in given)
-
     def stack(self, given: Stack) -> Stack:
-        """Return devices as they are in reality."""
-        return replace(given, wire=self.wire(given.wire), catheters=self.catheters(given.catheters))
+        """Return devices as they are in reality: catheters' friction on the wall differs as the wire's does."""
+        around = tuple(replace(each, friction=each.friction * self.friction_factor) for each in given.catheters)
+        return replace(given, wire=self.wire(given.wire), catheters=around)
 
     def axis(self, given: Anatomy) -> Float[np.ndarray, "3"]:
         """Return the guiding catheter's axis in reality, a unit vector into the vessel."""

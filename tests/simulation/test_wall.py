@@ -1,4 +1,4 @@
-"""Friction and stiffness of the wall that vary along the vessel."""
+"""A wall that yields, and friction and stiffness that vary along the vessel; what cannot be followed is invalid."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bend import vessel
 
 from endopilot.anatomy.distance import sample
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import COMPLIANT_WALL_AT_TIP_MM, COMPLIANT_WALL_STIFFENING_MM2, SimulatorConfig
 from endopilot.simulation.core_state import CONTACTS, LIMIT, NODE, NORMAL_FORCE, OFFSET, POSITION, nodes_of, with_nodes
 from endopilot.simulation.groups import factor_at
 from endopilot.simulation.simulate import simulate
@@ -18,8 +20,11 @@ from endopilot.simulation.simulator import Simulator
 
 WIRE = read_wire("workhorse-014")
 CORE = SimulatorConfig(time_step_s=0.05, element_mm=1.5, threads=1, tolerance_mm=1e-6)
+STIFF = read_wire("stiff-014")
 PUSH = np.tile([5.0, 0.3], (1, 16, 1))
 START = np.array([[20.0, 0.0]])
+FARTHER = np.tile([5.0, 0.3], (2, 24, 1))
+RIGID, SOFT = SimulatorConfig(), SimulatorConfig(compliant_wall_n_mm2=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -133,3 +138,44 @@ def test_a_factor_is_linear_between_its_places(bend):
         SimulatorConfig(wall_around=(1.0, 2.0))
     with pytest.raises(InputError, match=r"wall_along: the wall has 0\.0025 N/mm² at least"):
         SimulatorConfig(compliant_wall_n_mm2=0.01, wall_along=(1.0, 0.25))
+
+
+def test_a_stiff_wire_straightens_a_compliant_vessel(bend) -> None:
+    rigid, soft = (simulate(bend, STIFF, FARTHER, config=config) for config in (RIGID, SOFT))
+    assert rigid.valid.all() and soft.valid.all()
+    assert soft.wall_force.max() < 0.7 * rigid.wall_force.max()
+    assert soft.base_force.max() < rigid.base_force.max()
+    # The wire cuts the bend: its tip, in the straight part behind it, has the same length of wire and more vessel.
+    assert (soft.tip.abscissa[:, -1] != rigid.tip.abscissa[:, -1]).all()
+
+
+def test_the_displacement_does_not_depend_on_the_elements(bend) -> None:
+    # The wall's stiffness belongs to the length of the wire, not to its nodes.
+    rough, fine = (simulate(bend, STIFF, FARTHER[:1], config=replace(SOFT, element_mm=size)) for size in (0.75, 0.375))
+    np.testing.assert_allclose(fine.tip_position[0, -1], rough.tip_position[0, -1], atol=0.01)
+    np.testing.assert_allclose(fine.contact_force_sum[0, 8:], rough.contact_force_sum[0, 8:], rtol=0.05)
+
+
+def test_the_tip_takes_more_of_the_wall_along_than_its_own_length() -> None:
+    # Head on, the tip alone touches: F = K (l/4 + 6.4 mm) d exp(s d²), with d by which it is beyond the blind end.
+    anatomy, wire = vessel(0.01), STIFF.with_tip(bend_rad=0.0, stiffness_factor=1.0)
+    pushed = simulate(anatomy, wire, np.tile([0.3, 0.0], (1, 4, 1)), initial=np.array([[34.9, 0.0]]), config=SOFT)
+    depth = wire.tip_radius_mm - sample(anatomy.distance_map, pushed.tip_position[0, :, 0])
+    assert 0.02 < depth[0] < depth[-1] < 0.5
+    stiffness = 0.01 * (SOFT.element_mm / 4 + COMPLIANT_WALL_AT_TIP_MM)
+    force = stiffness * depth * np.exp(COMPLIANT_WALL_STIFFENING_MM2 * depth**2)
+    np.testing.assert_allclose(pushed.contact_force_max[0], force, rtol=0.01)
+
+
+def test_a_wall_that_would_yield_beyond_the_distance_map_is_refused() -> None:
+    for stiffness in (0.0, 0.003):
+        with pytest.raises(InputError, match=f"compliant_wall_n_mm2: {stiffness:g}"):
+            SimulatorConfig(compliant_wall_n_mm2=stiffness)
+
+
+def test_a_stiff_wire_in_sharp_bends_stays_within_the_map() -> None:
+    # A bed of springs that did not stiffen would let this wire leave the map.
+    anatomy = make_patient(AtlasConfig(), 1)
+    deep = 0.5 * anatomy.tree.longest_path().abscissa[-1]
+    pushed = simulate(anatomy, STIFF, np.zeros((1, 1, 2)), initial=np.array([[deep, 0.0]]), config=SOFT)
+    assert pushed.valid.all()
