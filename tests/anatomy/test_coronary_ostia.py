@@ -26,8 +26,7 @@ from endopilot.vessels.coronary_ostia import CRUX_FROM_OSTIUM_MM, Crux, end_scor
 from endopilot.vessels.ends import open_ends, skeleton_of
 from endopilot.vessels.inlet import component, entrance, grid_points
 from endopilot.vessels.sources import Polylines
-from endopilot.vessels.surface import surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import distance_map_from_surface, surface_from_mask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"

@@ -53,7 +53,7 @@ def test_a_nifti_of_either_byte_order_packed_or_not_whatever_its_suffix(tmp_path
         ({"datatype": (32,), "bitpix": (64,)}, "datatype 32"),
         ({"datatype": (128,), "bitpix": (24,)}, "colour"),
         ({"intent_code": (1007,)}, "intent_code 1007"),
-        ({"xyzt_units": (5,)}, "xyzt_units 5"),
+        ({"xyzt_units": (1,)}, "xyzt_units 1: lengths are not in mm"),
         ({"scl": (np.nan, 0)}, "scl_slope nan"),
         ({"scl": (1, np.inf)}, "scl_inter inf"),
         ({"pixdim": (1, 4, 5, 12.5, 1, 1, 1, 1)}, "pixdim 4×5×12.5"),
@@ -94,15 +94,6 @@ def test_sform_and_qform_that_contradict_each_other(tmp_path):
     _read(atlas, "sform is no rigid placement")
 
 
-@pytest.mark.parametrize(("unit", "factor", "name"), [(1, 1e-3, "m"), (3, 1e3, "µm")])
-def test_a_nifti_in_another_unit_is_converted_and_it_is_said(tmp_path, unit, factor, name):
-    fields = {"pixdim": (1, *(SPACING * factor), 1, 1, 1, 1), "xyzt_units": (unit,)}
-    rows = (np.c_[TURN * SPACING, ORIGIN] * np.array([-1, -1, 1])[:, None] * factor).ravel()
-    volume = _read(nifti(tmp_path / "ct.nii", srow=tuple(rows), **fields), f"says {name}; lengths were converted")
-    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-4)
-    _refused(nifti(tmp_path / "meant-mm.nii", xyzt_units=(unit,)), f"xyzt_units {unit} says {name}, but voxels")
-
-
 @pytest.mark.parametrize(("slope", "intercept"), [(2, -1024), (-1, 3), (0.5, 0), (0, 7)])
 def test_the_rescale_of_a_nifti(tmp_path, slope, intercept):
     volume = read_volume(nifti(tmp_path / "ct.nii", scl=(slope, intercept)))
@@ -114,9 +105,7 @@ def test_the_rescale_of_a_nifti(tmp_path, slope, intercept):
     ("space", "signs"),
     [
         ("RAS", (-1, -1, 1)),
-        ("LAS", (1, -1, 1)),
         ("LPS", (1, 1, 1)),
-        ("RPI", (-1, 1, -1)),
         ("left-anterior-superior", (1, -1, 1)),
         ("Right-Anterior-Superior", (-1, -1, 1)),
     ],
@@ -137,9 +126,7 @@ def test_the_space_of_an_nrrd(tmp_path, space, signs):
         ({"space_origin": "(1,2)"}, "space origin"),
         ({"space_directions": "(1,0,0) (0,1,0)"}, "space directions"),
         ({"space_directions": "(1,0,0) (0,1,0) none"}, "2 axes in space"),
-        ({"space_units": '"mm" "mm" "cm"'}, "space units .*not one unit"),
-        ({"space_units": '"parsec" "parsec" "parsec"'}, "space units 'parsec'"),
-        ({"space_units": '"m" "m" "m"'}, "says m, but voxels"),
+        ({"space_units": '"mm" "mm" "cm"'}, "space units .*are not mm"),
         ({"spacings": "1 1 1"}, "spacings 1 1 1 contradict"),
         ({"sizes": "4 5"}, "dimension and sizes"),
         ({"sizes": "4 5 5"}, "more than the 200 bytes"),
@@ -155,16 +142,6 @@ def test_the_space_of_an_nrrd(tmp_path, space, signs):
 )
 def test_an_nrrd_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
     _refused(nrrd(tmp_path / "ct.nrrd", **fields), reason)
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("cm", 10.0), ("m", 1000.0), ("um", 1e-3), ("micron", 1e-3)])
-def test_an_nrrd_in_another_unit_is_converted_and_it_is_said(tmp_path, unit, factor):
-    vectors = " ".join("({},{},{})".format(*step) for step in (TURN * SPACING / factor).T)
-    origin = "({},{},{})".format(*(ORIGIN / factor))
-    units = " ".join([f'"{unit}"'] * 3)
-    path = nrrd(tmp_path / "ct.nrrd", space_directions=vectors, space_origin=origin, space_units=units)
-    volume = _read(path, f"says {unit}; lengths were converted")
-    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-6)
 
 
 def test_the_encodings_of_an_nrrd(tmp_path):
@@ -205,7 +182,7 @@ def test_voxels_in_several_files_or_in_none_are_refused(tmp_path):
         ({"HeaderSize": "-1"}, "HeaderSize"),
         ({"BinaryData": "False"}, "BinaryData"),
         ({"AnatomicalOrientation": "LPI", "TransformMatrix": None}, "AnatomicalOrientation LPI"),
-        ({"DistanceUnits": "furlong"}, "DistanceUnits 'furlong'"),
+        ({"DistanceUnits": "cm"}, "DistanceUnits 'cm' is not mm"),
     ],
 )
 def test_a_metaimage_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
@@ -217,9 +194,6 @@ def test_what_a_metaimage_leaves_open_is_noted(tmp_path):
         _read(metaimage(tmp_path / "a.mha", TransformMatrix=None), "no TransformMatrix").direction, np.eye(3)
     )
     assert np.allclose(_read(metaimage(tmp_path / "b.mha", Offset=None), "no Offset").origin_mm, 0.0)
-    cm = {"ElementSpacing": "0.04 0.05 0.125", "Offset": "1 2 3", "DistanceUnits": "cm"}
-    volume = _read(metaimage(tmp_path / "h.mha", **cm), "DistanceUnits says cm")
-    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-6)
 
 
 def test_the_encodings_of_a_metaimage(tmp_path):

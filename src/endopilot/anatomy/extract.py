@@ -44,8 +44,7 @@ from endopilot.vessels.sources import (
     transformed,
     unit_name,
 )
-from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, distance_map_from_surface, surface_from_mask
 from endopilot.vessels.topology import parted, touch_remarks
 
 CORONARY_RADIUS_MM = 1.6  # mean radius of a coronary tree at most, for the grid where the aorta is there too

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from endopilot.imaging.grid import connected_components, dilated, distance_to_outside
+from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.imaging.voxels import dilated
 from endopilot.types import Volume
 
 _SMOOTHING_MM = 0.3  # width of the Gaussian against noise, mm: about the scanner's own blur

@@ -30,7 +30,6 @@ MM_PER_UNIT = {
     **dict.fromkeys(("in", "inch", "inches"), 25.4),
 }
 """Millimetres in each unit of length that a header may name, in lower case."""
-_CONVERTED_MM = (1e-3, 20.0)  # voxel sizes that a unit other than mm may lead to, mm: else the unit is wrong
 
 
 def require(good: object, path: Path, said: str) -> None:
@@ -163,20 +162,6 @@ def slice_grid(
         path=path,
         fields=Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
     )
-
-
-def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
-    """Return the factor from a unit of length to mm, and its note; InputError if voxels are not of 1 µm to 20 mm."""
-    factor = MM_PER_UNIT.get(unit.strip().lower())
-    if factor is None:
-        raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")
-    if factor == 1.0:
-        return 1.0, ()
-    least, most = _CONVERTED_MM
-    lengths = np.abs(sizes) * factor
-    odd = f"{field} says {unit}, but voxels would then have {lengths_text(lengths)} mm; export it in mm"
-    require((lengths >= least).all() and (lengths <= most).all(), path, odd)
-    return factor, (f"{path.name}: {field} says {unit}; lengths were converted to mm",)
 
 
 def lengths_text(lengths: np.ndarray) -> str:

@@ -17,7 +17,6 @@ from endopilot.errors import InputError
 from endopilot.imaging.geometry import (
     Fields,
     Geometry,
-    converted,
     farthest_apart_mm,
     geometry,
     lengths_text,
@@ -33,7 +32,7 @@ _SCANNER = 1  # code of a transform to the scanner's anatomical coordinates
 _LARGEST_OFFSET = 1 << 40
 _LONGEST_EXTENSION = 1 << 24
 _XML_EXTENSION = 30  # code of an extension of Caret, whose XML may name labels (NIFTI_ECODE_CARET in nifti1_io.h)
-_UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
+_MILLIMETRES = (0, 2)  # units of length in xyzt_units: unknown, mm
 _INTENTS = (0, 1001, 1002, 1003)  # a grey-level image or a mask: nothing, an estimate, labels, names of regions
 
 _HEADER_BYTES = 348
@@ -141,14 +140,14 @@ def _geometry(header: dict[str, Any], size: tuple[int, int, int], path: Path) ->
     require(max(qform_code, sform_code) > 0, path, nowhere)
     sizes = np.array(header["pixdim"][1:4], dtype=float)
     require(np.isfinite(sizes).all(), path, f"pixdim holds {sizes}, which is not finite; export it again")
-    unit = _UNITS.get(header["xyzt_units"] & 7, "")
-    factor, notes = converted(unit, sizes, path=path, field=f"xyzt_units {header['xyzt_units']}")
+    in_mm, notes = header["xyzt_units"] & 7 in _MILLIMETRES, tuple[str, ...]()
+    require(in_mm, path, f"xyzt_units {header['xyzt_units']}: lengths are not in mm; export it in mm")
     first, other = ("qform", "sform") if sform_code <= 0 or qform_code == _SCANNER != sform_code else ("sform", "qform")
     forms = {"sform": _sform, "qform": _qform}
-    chosen = forms[first](header, size, path, factor)
+    chosen = forms[first](header, size, path)
     if min(qform_code, sform_code) > 0:
         try:
-            notes += _agreement(chosen, forms[other](header, size, path, factor), size, header, path)
+            notes += _agreement(chosen, forms[other](header, size, path), size, header, path)
         except InputError:
             if header["codes"].count(_SCANNER) != 1:
                 raise
@@ -159,18 +158,18 @@ def _geometry(header: dict[str, Any], size: tuple[int, int, int], path: Path) ->
     return replace(chosen, notes=(*notes, *chosen.notes))
 
 
-def _sform(header: dict[str, Any], size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
-    rows = np.array(header["srow"], dtype=float).reshape(3, 4) * _RAS_TO_LPS[:, None] * factor
+def _sform(header: dict[str, Any], size: tuple[int, int, int], path: Path) -> Geometry:
+    rows = np.array(header["srow"], dtype=float).reshape(3, 4) * _RAS_TO_LPS[:, None]
     fields = Fields(*["srow_x, srow_y and srow_z"] * 3)
     place = geometry(*parted(rows[:, :3]), rows[:, 3], size, path=path, fields=fields)
-    pixdim = np.abs(header["pixdim"][1:4]) * factor
+    pixdim = np.abs(header["pixdim"][1:4])
     two = f"its affine gives voxels of {lengths_text(place.spacing_mm)}, its pixdim {lengths_text(pixdim)}"
     same = np.allclose(place.spacing_mm, pixdim, rtol=_SPACING_TOLERANCE)
     require(same, path, f"{two}; one of them is wrong: export it again")
     return place
 
 
-def _qform(header: dict[str, Any], size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
+def _qform(header: dict[str, Any], size: tuple[int, int, int], path: Path) -> Geometry:
     b, c, d = (float(value) for value in header["quatern"][:3])
     offset = np.array(header["quatern"][3:], dtype=float)
     none = f"quatern_b, _c and _d ({b:g}, {c:g}, {d:g}) are no unit quaternion; export it again"
@@ -178,9 +177,9 @@ def _qform(header: dict[str, Any], size: tuple[int, int, int], path: Path, facto
     a = np.sqrt(max(1.0 - (b * b + c * c + d * d), 0.0))
     turn = Rotation.from_quat([b, c, d, a]).as_matrix()
     turn[:, 2] *= -1.0 if header["pixdim"][0] < 0 else 1.0
-    sizes = np.array(header["pixdim"][1:4], dtype=float) * factor
+    sizes = np.array(header["pixdim"][1:4], dtype=float)
     fields = Fields("quatern_b, quatern_c and quatern_d", "pixdim", "qoffset")
-    return geometry(turn * _RAS_TO_LPS[:, None], sizes, offset * _RAS_TO_LPS * factor, size, path=path, fields=fields)
+    return geometry(turn * _RAS_TO_LPS[:, None], sizes, offset * _RAS_TO_LPS, size, path=path, fields=fields)
 
 
 def _agreement(

@@ -14,16 +14,19 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted, require
+from endopilot.imaging.geometry import Fields, Geometry, geometry, parted, require
 from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import read_voxels_beside
 
 _LONGEST_HEADER = 1 << 20
 _NOT_SUCH = "its content does not match its suffix, or its header is damaged; export it again"
 _NO_END = "truncated or damaged (its header does not end); copy or export it again"
-_TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
-_LETTERS = {word[0]: word for word in _TO_LPS}
-_WORLD_AXES = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
+_SPACES = {
+    **dict.fromkeys(("right-anterior-superior", "ras"), (-1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (1.0, 1.0, 1.0)),
+}
+"""The patient's axes that NRRD defines, and the signs that turn them to LPS."""
 
 _NRRD_TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -141,34 +144,24 @@ def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[Float[np.
 def _nrrd_geometry(
     fields: dict[str, str], vectors: list[Float[np.ndarray, "3"] | None], size: tuple[int, ...], path: Path
 ) -> Geometry:
-    to_lps = _to_lps(fields["space"], path)
+    space = fields["space"]
+    where = f"space {space[:40]!r} does not say where the patient's left, back and head are"
+    require(space.lower() in _SPACES, path, f"{where}; export it in left-posterior-superior")
+    to_lps = np.array(_SPACES[space.lower()])
     nowhere = "has no place (no space origin in its header); export it with its space origin"
     require("space origin" in fields, path, nowhere)
     origin = _vector(fields["space origin"], "space origin", path)
     steps = np.array([vector for vector in vectors if vector is not None]).T
-    stated = fields.get("space units", '"mm"')
-    units = set(re.findall(r'"([^"]*)"', stated)) - {""} or {"mm"}
-    one = len(units) == 1 and '"' in stated
-    require(one, path, f"space units {stated[:60]!r} are not one unit; export it in mm")
+    units = fields.get("space units", "").lower()
+    in_mm = set(re.findall(r'"([^"]*)"', units)) <= {"", "mm"} and ("space units" not in fields or '"' in units)
+    require(in_mm, path, f"space units {units[:60]!r} are not mm; export it in mm")
     lengths = np.linalg.norm(steps, axis=0)
-    factor, notes = converted(units.pop(), lengths, path=path, field="space units")
     along = zip(fields.get("spacings", "").split(), vectors, strict=False)
     given = [word for word, vector in along if vector is not None and word.lower() != "nan"]
     same = not given or np.allclose(_numbers(given, 3, "spacings", path), lengths, rtol=1e-2)
     require(same, path, f"spacings {' '.join(given)} contradict space directions; export it again")
-    steps, origin = to_lps[:, None] * steps * factor, to_lps * origin * factor
-    place = geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
-    return replace(place, notes=(*notes, *place.notes))
-
-
-def _to_lps(space: str, path: Path) -> np.ndarray:
-    words = space.strip().lower().split("-")
-    if len(words) == 1 and len(words[0]) == 3:
-        words = [_LETTERS.get(letter, "") for letter in words[0]]
-    known = len(words) == 3 and all(word in pair for word, pair in zip(words, _WORLD_AXES, strict=True))
-    where = f"space {space[:40]!r} does not say where the patient's left, back and head are"
-    require(known, path, f"{where}; export it in left-posterior-superior")
-    return np.array([_TO_LPS[word] for word in words])
+    steps, origin = to_lps[:, None] * steps, to_lps * origin
+    return geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
 
 
 def _values(
@@ -277,8 +270,8 @@ def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Pat
     sizeless = "has no ElementSpacing, so that its voxels have no size; export it again"
     require("ElementSpacing" in fields, path, sizeless)
     spacing = _numbers(fields["ElementSpacing"].split(), count, "ElementSpacing", path)[:3]
-    factor, notes = converted(fields.get("DistanceUnits", "mm"), spacing, path=path, field="DistanceUnits")
-    origin = np.zeros(3)
+    unit, notes, origin = fields.get("DistanceUnits", "mm"), tuple[str, ...](), np.zeros(3)
+    require(unit.lower() == "mm", path, f"DistanceUnits {unit[:20]!r} is not mm; export it in mm")
     if "Offset" in fields:
         origin = _numbers(fields["Offset"].split(), count, "Offset", path)[:3]
     else:
@@ -293,7 +286,7 @@ def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Pat
         require(words in ("RAI", "???"), path, turned)
         direction = np.eye(3)
         notes += (f"{path.name}: has no TransformMatrix; its axes were taken as left, posterior and superior",)
-    place = geometry(direction, spacing * factor, origin * factor, size, path=path, fields=_META_FIELDS)
+    place = geometry(direction, spacing, origin, size, path=path, fields=_META_FIELDS)
     return replace(place, notes=(*notes, *place.notes))
 
 

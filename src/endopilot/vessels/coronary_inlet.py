@@ -25,8 +25,7 @@ from endopilot.vessels.coronary_ostia import (
 from endopilot.vessels.ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.sources import check_unit
-from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import Surface, distance_map_from_surface, filled_box, surface_from_mask
 
 CERTAIN = 0.8  # an ostium less probable than this is asked for
 PRESENT = 0.5  # the other artery is in the lumen if it begins in another piece with at least this probability

@@ -31,13 +31,13 @@ from endopilot.imaging.coronary_doubts import FoundTree, Scan, coronary_doubts
 from endopilot.imaging.grid import (
     LEAST_BLOOD_HU,
     connected_components,
-    dilated,
     distance_to_outside,
     interpolate_like,
     resample,
 )
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.vessel_tracking import track_tree, vesselness
+from endopilot.imaging.voxels import dilated
 from endopilot.lines import length_along
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
