@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import struct
 import zlib
 
 import numpy as np
@@ -92,6 +93,24 @@ def test_sform_and_qform_that_contradict_each_other(tmp_path):
         _refused(path, f"qform_code {code} and sform_code {code} do not tell")
     atlas = nifti(tmp_path / "atlas.nii", axes=skewed(0.2), qform_code=(1,), sform_code=(4,), quatern=upright)
     _read(atlas, "sform is no rigid placement")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_the_names_of_labels_in_a_nifti_extension_are_read(tmp_path, order):
+    def labels(*extensions):
+        parts = [struct.pack(f"{order}2i", len(content) + 8, kind) + content for kind, content in extensions]
+        voxels = np.where(RAMP > 0, 51, 7).astype("u1")
+        fields = {"extension": b"".join(parts), "datatype": (2,), "bitpix": (8,)}
+        return nifti(tmp_path / "a.nii", order=order, voxels=voxels, **fields)
+
+    names = b'<CaretExtension><VolumeInformation><LabelTable><Label Red="1" Key="7">left &amp; right</Label>'
+    names += b'<Label Key="51"><![CDATA[heart]]></Label><Label Key="9">absent</Label></LabelTable></VolumeInformation>'
+    path = labels((4, b"x" * 24), (30, names + b"</CaretExtension>\0\0\0\0"))
+    with pytest.raises(InputError, match=r"2 labels \(7 \(left & right\), 51 \(heart\)\)"):
+        read_mask(path)
+    np.testing.assert_array_equal(read_mask(path, label="Heart").volume.voxels, RAMP > 0)
+    for content in (b"<Label Key='7'>no end", b"<a><Label Key='x'>seven</Label></a>", b"\xff" * 16):
+        np.testing.assert_array_equal(read_mask(labels((30, content)), label=51).volume.voxels, RAMP > 0)
 
 
 @pytest.mark.parametrize(("slope", "intercept"), [(2, -1024), (-1, 3), (0.5, 0), (0, 7)])

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import struct
 import subprocess
 import sys
 
@@ -287,38 +286,6 @@ def test_label_maps_are_not_taken_for_grey_masks(tmp_path):
         with pytest.raises(InputError, match=r"labels \(-1, 1, 2"):
             read_mask(tmp_path / "labels.nrrd")
         np.testing.assert_array_equal(read_mask(tmp_path / "labels.nrrd", label=2).volume.voxels, labels == 2)
-
-
-def _with_extensions(path, *extensions: tuple[int, bytes], order: str = "<") -> None:
-    """Write labels 7 and 51 as NIfTI-1 with header extensions, each of a kind and a content."""
-    labels = np.zeros((5, 6, 7), np.uint8)
-    labels[1:3], labels[3:] = 7, 51
-    parts = [struct.pack(f"{order}2i", len(content) + 8, kind) + content for kind, content in extensions]
-    header = bytearray(348)
-    struct.pack_into(f"{order}i", header, 0, 348)
-    struct.pack_into(f"{order}8h", header, 40, 3, 7, 6, 5, 1, 1, 1, 1)
-    struct.pack_into(f"{order}2h", header, 70, 2, 8)
-    struct.pack_into(f"{order}4f", header, 76, 1, 1, 1, 1)
-    struct.pack_into(f"{order}2f", header, 108, 352 + sum(map(len, parts)), 1)
-    header[123] = 2
-    struct.pack_into(f"{order}h", header, 254, 1)
-    struct.pack_into(f"{order}12f", header, 280, *np.eye(3, 4).ravel())
-    header[344:348] = b"n+1\0"
-    path.write_bytes(bytes(header) + b"\1\0\0\0" + b"".join(parts) + labels.tobytes())
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_the_names_of_labels_in_a_nifti_extension_are_read(tmp_path, order):
-    names = b'<CaretExtension><VolumeInformation><LabelTable><Label Red="1" Key="7">left &amp; right</Label>'
-    names += b'<Label Key="51"><![CDATA[heart]]></Label><Label Key="9">absent</Label></LabelTable></VolumeInformation>'
-    names += b"</CaretExtension>\0\0\0\0"
-    _with_extensions(tmp_path / "a.nii", (4, b"x" * 24), (30, names), order=order)
-    with pytest.raises(InputError, match=r"2 labels \(7 \(left & right\), 51 \(heart\)\)"):
-        read_mask(tmp_path / "a.nii")
-    assert read_mask(tmp_path / "a.nii", label="Heart").volume.voxels.sum() == 84
-    for content in (b"<Label Key='7'>no end", b"<a><Label Key='x'>seven</Label></a>", b"\xff" * 16):
-        _with_extensions(tmp_path / "b.nii", (30, content), order=order)
-        assert read_mask(tmp_path / "b.nii", label=51).volume.voxels.sum() == 84
 
 
 _OF_ARRAYS = """
