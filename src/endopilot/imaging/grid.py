@@ -88,14 +88,6 @@ def distance_to_outside(
     return np.maximum(sitk.GetArrayFromImage(signed), np.float32(0))
 
 
-def distance_and_nearest(
-    mask: Bool[np.ndarray, "nz ny nx"], spacing_mm: float | tuple[float, float, float]
-) -> tuple[Float[np.ndarray, "nz ny nx"], tuple[np.ndarray, ...]]:
-    """Return `distance_to_outside`, and the indices (k, j, i) of that nearest voxel outside."""
-    distance, nearest = ndimage.distance_transform_edt(mask, sampling=spacing_mm, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
-    return distance.astype(np.float32), tuple(nearest)
-
-
 def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = False) -> Int[np.ndarray, "nz ny nx"]:
     """Return numbers from 1 of a mask's connected parts, 0 outside; `corners` connects at edges and corners too."""
     structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
