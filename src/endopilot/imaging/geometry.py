@@ -21,16 +21,6 @@ AXES_TOLERANCE = 1e-2  # cosine between axes, and error of a unit vector's lengt
 _PLACE_TOLERANCE = 0.05  # a slice may lie off its place by this share of the step: positions have few digits
 _ROUNDING = 1e-5  # what single precision and six decimals leave, some micrometres: it is not noted
 
-MM_PER_UNIT = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
-    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 1e-3),
-    **dict.fromkeys(("in", "inch", "inches"), 25.4),
-}
-"""Millimetres in each unit of length that a header may name, in lower case."""
-
 
 def require(good: object, path: Path, said: str) -> None:
     """Raise InputError, which names the file and what is wrong with it, unless a check of its header is passed."""
