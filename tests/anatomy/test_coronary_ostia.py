@@ -19,16 +19,14 @@ from endopilot.anatomy.labels import label_tree
 from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask, Volume
-from endopilot.vessels.coronary_inlet import _coarse, coronary_inlet
+from endopilot.vessels.coronary_inlet import coronary_inlet
 from endopilot.vessels.coronary_ostia import CRUX_FROM_OSTIUM_MM, Crux, end_score, find_crux, rank_ostia
 from endopilot.vessels.ends import open_ends, skeleton_of
 from endopilot.vessels.inlet import component, entrance, grid_points
 from endopilot.vessels.sources import Polylines
-from endopilot.vessels.surface import surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import distance_map_from_surface, surface_from_mask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"
@@ -74,12 +72,6 @@ def test_a_surface_of_both_arteries_is_taken_apart(both):
     assert np.linalg.norm(found.position - PLACE_MM["lca"]) < 4.0
 
 
-def test_a_single_artery_is_found_and_never_taken_for_the_other(right_alone):
-    assert np.linalg.norm(coronary_inlet(right_alone, "rca", "patient").position) < 4.0
-    with pytest.raises(InputError, match=r"holds no left coronary artery: .* looks like the right one; .*--vessel rca"):
-        coronary_inlet(right_alone, "lca", "patient")
-
-
 def test_a_short_artery_is_told(both):
     def left_or_near(points):
         return (np.linalg.norm(points, axis=1) < 28) | ((points[:, 1] > 15) & (points[:, 0] > 10))
@@ -96,7 +88,6 @@ def test_fine_masks_are_looked_at_on_a_coarser_grid(right_alone):
     origin = volume.index_to_world(np.full(3, -1 / 3))
     fine = LumenMask(Volume(doubled, volume.spacing_mm / 3, origin, volume.direction))
     assert np.linalg.norm(coronary_inlet(fine, "rca", "patient").position) < 4.0
-    assert _coarse(fine.volume).voxels.sum() < 0.3 * doubled.sum()
 
 
 @pytest.mark.parametrize("vessel", ["rca", None])
@@ -149,7 +140,7 @@ def test_the_likeliest_pair_of_ends_wins_over_each_ends_own_score(both):
     assert ranking.absent + sum(candidate.probability for candidate in ranking.candidates) <= 1.0 + 1e-9
 
 
-def test_two_ends_of_one_stub_are_one_candidate_between_them(both):
+def test_two_ends_of_one_stub_are_one_candidate_between_them():
     lumens = [artery("rca"), artery("lca")]
     ends = [open_ends(skeleton_of(*grid_points(each, each.values > 0), each.spacing_mm)) for each in lumens]
     true = max(ends[1], key=lambda end: end_score(end, "lca"))
@@ -213,21 +204,14 @@ def right_artery(*beyond):
     return polyline(OSTIUM, beside(OSTIUM, -35.0, -15.0, -20.0), beside(OSTIUM, -25.0, 0.0, -50.0), CRUX, *beyond)
 
 
-@pytest.mark.parametrize(("right", "left", "dominance"), [(5, 40, "right"), (40, 5, "left"), (5, 5, "balanced")])
+@pytest.mark.parametrize(
+    ("right", "left", "dominance"), [(5, 40, "right"), (40, 5, "left"), (5, 5, "balanced"), (40, 40, None)]
+)
 def test_the_artery_that_reaches_the_crux_is_dominant(right, left, dominance):
     trees = [polyline(OSTIUM, OSTIUM + (1.0 - gap / 62.7) * CRUX_FROM_OSTIUM_MM) for gap in (right, left)]
     found = find_crux(OSTIUM, *trees)
-    assert found is not None and found.dominance == dominance
-    np.testing.assert_array_equal(found.position, CRUX)
-
-
-def test_arteries_that_end_before_the_crux_leave_dominance_open():
-    assert (
-        find_crux(
-            OSTIUM, polyline(OSTIUM, beside(OSTIUM, 0.0, 0.0, -20.0)), polyline(OSTIUM, beside(OSTIUM, 30.0, 0, 0))
-        )
-        is None
-    )
+    assert (found and found.dominance) == dominance
+    assert found is None or np.array_equal(found.position, CRUX)
 
 
 @pytest.mark.parametrize(

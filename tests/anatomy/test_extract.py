@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from endopilot.anatomy.centerline import to_cut
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
-from endopilot.imaging.volume import write_volume
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import Polylines
@@ -85,17 +83,6 @@ def test_fork_is_found_with_its_root(fork_mask):
     assert np.linalg.norm(place) < 1.5
 
 
-def test_one_label_of_a_mask_file_is_chosen(fork_mask, tmp_path):
-    volume = fork_mask.volume
-    labels = 2 * np.asarray(volume.voxels, dtype=np.uint8)
-    labels[:, :2] = 1  # a slab that is no vessel
-    write_volume(replace(volume, voxels=labels), tmp_path / "labels.nii.gz")
-    with pytest.raises(InputError, match="holds 2 labels"):
-        extract_anatomy(tmp_path / "labels.nii.gz")
-    anatomy = extract_anatomy(tmp_path / "labels.nii.gz", label=2)
-    assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
-
-
 def test_given_ostium_is_the_root_and_mid_vessel_ostium_points_distally(fork_mask):
     side_tip = forked_tree().branches[2].centerline.points[-1] - [0, 0, 20]
     anatomy = extract_anatomy(fork_mask, name="x", config=AnatomyConfig(ostium_mm=tuple(side_tip)))
@@ -145,20 +132,6 @@ def test_surface_with_holes_and_inverted_normals(fork_mask, tmp_path):
     assert len(anatomy.provenance["source"]["sha256"]) == 64
 
 
-@pytest.mark.parametrize(("factor", "scale"), [(0.1, "10"), (0.001, "1000"), (1000.0, "0.001")])
-def test_coronary_centerlines_and_walls_in_another_unit_are_told_with_the_scale(factor, scale):
-    along = np.linspace(0.0, 1.0, 400)[:, None]
-    line = 70.0 * np.hstack([np.cos(3 * along), np.sin(3 * along), 0.3 * along])
-    lines = Polylines((factor * line,), (np.full(400, factor * 1.5),))
-    config = AnatomyConfig(vessel="rca")
-    with pytest.raises(InputError, match=f"--scale {scale}$"):
-        extract_anatomy(lines, name="tree", config=config)
-    tube = Surface(factor * line, np.arange(399)[:, None] + np.array([0, 1, 0]))
-    with pytest.raises(InputError, match=rf"--scale {scale}\)?$"):
-        extract_anatomy(tube, name="wall", config=config)
-    assert extract_anatomy(lines, name="tree", config=replace(config, scale=float(scale))).tree.branches
-
-
 def test_radii_in_another_unit_than_the_positions_are_told():
     line = np.outer(np.linspace(0.0, 90.0, 4000), [0.0, 0.6, 0.8])
     with pytest.raises(InputError, match=r"mean radius of 0\.05 mm.*positions and radii"):
@@ -176,53 +149,28 @@ def test_the_guiding_catheter_is_one_of_6_french_or_as_wide_as_a_narrower_ostium
     assert abs(extract_anatomy(narrow, name="narrow").catheter_radius_mm - 0.5) < 1e-6
 
 
-def save_lines(path, lines, radii):
-    import pyvista
-
-    data = pyvista.PolyData(np.concatenate(lines))
-    start, cells = 0, []
-    for line in lines:
-        cells += [len(line), *range(start, start + len(line))]
-        start += len(line)
-    data.lines = np.array(cells)
-    if radii is not None:
-        data.point_data["MaximumInscribedSphereRadius"] = np.concatenate(radii)
-    data.save(path)
-
-
-def test_overlapping_centerlines_become_one_tree(tmp_path):
-    tree = forked_tree()
-    paths = [tree.path(1), tree.path(2)]
-    save_lines(tmp_path / "cl.vtp", [p.points for p in paths], [p.radius for p in paths])
-    anatomy = extract_anatomy(read_source(tmp_path / "cl.vtp"), name="cl")
+def test_overlapping_centerlines_become_one_tree():
+    paths = [forked_tree().path(1), forked_tree().path(2)]
+    anatomy = extract_anatomy(Polylines(tuple(p.points for p in paths), tuple(p.radius for p in paths)), name="cl")
     assert len(anatomy.tree.branches) == 3 and is_sound(anatomy)
     assert abs(anatomy.tree.branches[0].centerline.abscissa[-1] - 20) < 2.0
 
 
-def empty(volume):
-    return np.zeros_like(volume.voxels)
-
-
-def block(volume):
-    return np.ones((40, 40, 40), dtype=bool)
-
-
-def ball(volume):
-    return np.linalg.norm(np.indices((50, 50, 50)) - 25, axis=0) < 20
-
-
-def noise(volume):
-    return np.random.default_rng(0).random((50, 50, 50)) < 0.4
+CUBE = (50, 50, 50)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"), [(empty, "empty"), (block, "solid block"), (ball, "no vessel"), (noise, "noise")]
+    ("voxels", "message"),
+    [
+        (np.zeros(CUBE, dtype=bool), "empty"),
+        (np.ones(CUBE, dtype=bool), "solid block"),
+        (np.linalg.norm(np.indices(CUBE) - 25, axis=0) < 20, "no vessel"),
+        (np.random.default_rng(0).random(CUBE) < 0.4, "noise"),
+    ],
 )
-def test_what_is_no_vessel_is_refused(fork_mask, make, message):
-    volume = fork_mask.volume
-    mask = LumenMask(Volume(make(volume), volume.spacing_mm, volume.origin_mm, volume.direction))
+def test_what_is_no_vessel_is_refused(voxels, message):
     with pytest.raises(InputError, match=message) as error:
-        extract_anatomy(mask, name="bad")
+        extract_anatomy(LumenMask(Volume(voxels, np.full(3, 0.5), np.zeros(3), np.eye(3))), name="bad")
     assert "\n" not in str(error.value)
 
 

@@ -16,8 +16,7 @@ from endopilot.anatomy.tree import make_centerline, parallel_transport, tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 from endopilot.types import Branch, Insertion, VesselTree
-from endopilot.vessels.surface import surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import distance_map_from_surface, surface_from_mask
 
 A_MM, B_MM = 8.0, 2.0
 SPEED = np.hypot(A_MM, B_MM)

@@ -48,7 +48,15 @@ def skewed(amount: float) -> np.ndarray:
     return axes
 
 
-def nifti(path: Path, *, axes: np.ndarray = TURN, order: str = "<", voxels: np.ndarray = RAMP, **fields) -> Path:
+def nifti(
+    path: Path,
+    *,
+    axes: np.ndarray = TURN,
+    order: str = "<",
+    voxels: np.ndarray = RAMP,
+    extension: bytes = b"",
+    **fields,
+) -> Path:
     """Write a NIfTI-1 file whose sform has these LPS axes; `fields` replaces what the header holds."""
     affine = np.c_[axes * SPACING, ORIGIN] * _RAS
     content = {
@@ -57,7 +65,7 @@ def nifti(path: Path, *, axes: np.ndarray = TURN, order: str = "<", voxels: np.n
         "datatype": (4,),
         "bitpix": (16,),
         "pixdim": (1, *SPACING, 1, 1, 1, 1),
-        "vox_offset": (352,),
+        "vox_offset": (352 + len(extension),),
         "scl": (1, 0),
         "xyzt_units": (2,),
         "sform_code": (1,),
@@ -68,12 +76,9 @@ def nifti(path: Path, *, axes: np.ndarray = TURN, order: str = "<", voxels: np.n
     header = bytearray(352)
     for name, values in content.items():
         kind, offset = _NIFTI[name]
-        struct.pack_into(order + kind, header, offset, *np.atleast_1d(values).tolist())
-    if "magic" in fields:
-        header[344:348] = fields["magic"][0]
-    else:
-        header[344:348] = b"n+1\0"
-    data = bytes(header) + voxels.astype(voxels.dtype.newbyteorder(order)).tobytes()
+        struct.pack_into(order + kind, header, offset, *values)
+    header[348] = bool(extension)
+    data = bytes(header) + extension + voxels.astype(voxels.dtype.newbyteorder(order)).tobytes()
     path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
     return path
 

@@ -10,8 +10,9 @@ from make_meshes import SLICER, arc, markup, tube, write_lines, write_surface
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
+from endopilot.types import LumenMask, Volume
 from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import Polylines, check_unit, transformed
+from endopilot.vessels.sources import AnatomySource, Polylines, check_unit, transformed
 from endopilot.vessels.surface import Surface
 
 RAS = np.array([-1.0, -1.0, 1.0])
@@ -98,15 +99,10 @@ def test_slicer_curves_in_voxel_or_unknown_axes_are_refused(tmp_path, system):
         read_source(tmp_path / "cl.mrk.json")
 
 
-def test_axes_given_for_a_mask_are_refused(tmp_path):
-    from endopilot.imaging.volume import write_volume
-    from endopilot.types import Volume
-
-    voxels = np.zeros((30, 10, 10), dtype=np.uint8)
-    voxels[2:28, 3:7, 3:7] = 1
-    write_volume(Volume(voxels, np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "mask.nii.gz")
-    with pytest.raises(InputError, match=r"mask\.nii\.gz: --coordinates ras was given, but the file is a mask"):
-        extract_anatomy(tmp_path / "mask.nii.gz", config=AnatomyConfig(coordinates="ras"))
+def test_axes_given_for_a_mask_are_refused():
+    mask = LumenMask(Volume(np.ones((4, 4, 4), dtype=bool), np.ones(3), np.zeros(3), np.eye(3)))
+    with pytest.raises(InputError, match=r"--coordinates ras was given, but the file is a mask"):
+        transformed(AnatomySource(mask, coordinates="lps"), scale=None, coordinates="ras")
 
 
 FACTORS = {"dm": 100.0, "m": 1000.0, "cm": 10.0, "µm": 0.001}
@@ -124,12 +120,15 @@ def test_all_units_that_explain_a_file_are_named():
         check_unit(np.array([[0.0, 0, 0], [0.0, 0.0, 7.0]]), 0.1, "lca", "tree.vtp")
     with pytest.raises(InputError, match=r"in cm or inches: use --scale 10 or --scale 25\.4$"):
         check_unit(np.array([[0.0, 0, 0], [0.0, 0.0, 10.0]]), 0.15, "generic", "tree.vtp")
-
-
-def test_what_is_longer_than_any_body_is_refused():
-    line = np.outer(np.linspace(0, 1e9, 50), [0, 0, 1.0])
     with pytest.raises(InputError, match="as no vessel does"):
-        extract_anatomy(Polylines((line,), (np.full(50, 1.5),)), name="far")
+        check_unit(np.array([[0.0, 0, 0], [0.0, 0.0, 1e9]]), 1.5, "generic", "tree.vtp")
+
+
+def test_lines_and_walls_in_cm_are_told_with_the_scale():
+    config = AnatomyConfig(vessel="rca", spacing_mm=1.5)
+    for content in (Polylines((0.1 * arc(),), (np.full(60, 0.15),)), Surface(0.1 * tube(arc())[0], tube(arc())[1])):
+        with pytest.raises(InputError, match=r"--scale 10\)?$"):
+            extract_anatomy(content, name="tree", config=config)
 
 
 @pytest.mark.parametrize("name", ["mesh.bin.stl", "mesh.obj", "mesh.ply", "mesh.vtk", "mesh.vtp"])

@@ -12,10 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_meshes import arc, markup, tube, write_lines, write_surface
 
-from endopilot.anatomy.tree import tree_from_polylines
 from endopilot.errors import InputError
 from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import Polylines
 from endopilot.vessels.surface import Surface
 
 
@@ -65,13 +63,6 @@ def test_lines_beside_triangles_are_noted(tmp_path):
     source = read_source(path)
     assert isinstance(source.content, Surface)
     assert source.notes == ("lines beside the triangles are left out: the file is read as a surface",)
-
-
-def test_points_that_coincide_become_one(tmp_path):
-    vertices, faces = tube(arc())
-    alone = vertices[faces].reshape(-1, 3)
-    source = read_source(write_surface(tmp_path / "mesh.ply", alone, np.arange(len(alone)).reshape(-1, 3)))
-    assert isinstance(source.content, Surface) and len(source.content.vertices) == len(vertices)
 
 
 def test_positions_and_radii_that_are_none_are_refused(tmp_path):
@@ -131,26 +122,3 @@ KEYS = ["type", "coordinateSystem", "coordinateUnits", "controlPoints", "measure
 def test_edited_curves_are_read_or_refused(changes):
     curve = markup(arc()[::6], np.full(10, 1.5)) | changes
     outcome("cl.mrk.json", json.dumps({"markups": [curve]}).encode())
-
-
-@given(
-    points=st.lists(st.tuples(*[st.floats(-200, 200)] * 3), min_size=2, max_size=25),
-    radii=st.lists(st.floats(0.05, 30), min_size=25, max_size=25),
-    cut=st.integers(0, 25),
-)
-@settings(max_examples=30, deadline=None, derandomize=True)
-def test_any_lines_become_a_tree_or_are_refused(points, radii, cut):
-    places, sizes = np.array(points), np.array(radii)[: len(points)]
-    parts = [part for part in (slice(None, cut), slice(cut, None)) if len(places[part]) > 1]
-    lines = Polylines(tuple(places[part] for part in parts), tuple(sizes[part] for part in parts))
-    if not parts:
-        return
-    try:
-        found = tree_from_polylines(lines, None, "lines.vtp")
-    except InputError as error:
-        assert "\n" not in str(error)
-        return
-    lengths = found.coverage
-    assert abs(lengths["reached_mm"] + lengths["left_out_mm"] - lengths["length_mm"]) < 0.3
-    for branch in found.tree.branches:
-        assert np.isfinite(branch.centerline.points).all() and (np.diff(branch.centerline.abscissa) >= 0).all()

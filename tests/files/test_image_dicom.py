@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
-import pydicom
 import pytest
 from make_images import ORIGIN, RAMP, SPACING, TURN, dicom, metaimage, nifti, nrrd
 
@@ -70,11 +67,6 @@ def test_trigger_times_may_vary_from_beat_to_beat(tmp_path):
     np.testing.assert_array_equal(read_volume(folder, phase=value).voxels, RAMP)
 
 
-def test_images_that_nothing_tells_apart_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"several images at one slice position.*nothing in their headers"):
-        read_volume(_phases(tmp_path / "ct", None, (1, 2)))
-
-
 def test_a_series_that_holds_one_phase_has_none_to_choose(tmp_path):
     with pytest.raises(InputError, match=r"no phase '75': .*one image at each position; leave --phase out"):
         read_volume(_phases(tmp_path / "ct", "NominalPercentageOfCardiacPhase", (75.0,)), phase="75")
@@ -97,31 +89,19 @@ def test_the_hash_is_that_of_the_slices_read(tmp_path):
     assert input_hash(folder, read_volume(folder).files) == hashes["75"] == input_hash(folder)
 
 
-def test_values_that_may_be_inverted_are_refused(tmp_path):
-    def change(k, slice_):
-        slice_.PhotometricInterpretation = "MONOCHROME1"
-
-    with pytest.raises(InputError, match=r"slice-0000\.dcm: PhotometricInterpretation MONOCHROME1"):
-        read_volume(dicom(tmp_path / "ct", change))
-
-
-@pytest.mark.parametrize(("kind", "note"), [("HU", False), ("", False), ("US", True), ("HU_MOD", True)])
-def test_a_rescale_to_hu(tmp_path, kind, note):
+@pytest.mark.parametrize("kind", ["HU", "", "US", "HU_MOD", "OD", "Doe^Jane"])
+def test_a_rescale_to_hu_is_read_and_one_to_something_else_is_refused(tmp_path, kind):
     def change(k, slice_):
         slice_.RescaleType = kind
 
-    volume = read_volume(dicom(tmp_path / "ct", change))
-    assert bool(volume.notes) == note and all(f"RescaleType {kind} was taken as HU" in n for n in volume.notes)
-
-
-@pytest.mark.parametrize("kind", ["OD", "MGML", "Z_EFF", "Doe^Jane"])
-def test_a_rescale_to_something_else_is_refused(tmp_path, kind):
-    def change(k, slice_):
-        slice_.RescaleType = kind
-
-    with pytest.raises(InputError, match="RescaleType is not HU") as caught:
-        read_volume(dicom(tmp_path / "ct", change))
-    assert "Doe" not in str(caught.value)
+    folder = dicom(tmp_path / "ct", change)
+    if kind in ("OD", "Doe^Jane"):
+        with pytest.raises(InputError, match="RescaleType is not HU") as caught:
+            read_volume(folder)
+        assert "Doe" not in str(caught.value)
+        return
+    notes = read_volume(folder).notes
+    assert notes == ((f"ct: RescaleType {kind} was taken as HU",) if kind in ("US", "HU_MOD") else ())
 
 
 def test_a_rescale_and_a_sign_of_each_slice(tmp_path):
@@ -151,27 +131,6 @@ def test_pixels_that_show_nothing_become_air_and_it_is_said(tmp_path, padding):
     assert volume.notes == ("ct: 12 pixels of PixelPaddingValue, which show nothing, were set to -1024 HU",)
 
 
-def test_numbers_of_slices_agree_with_their_noun(tmp_path):
-    folder = dicom(tmp_path / "ct")
-    for number in (3, 2, 1):
-        for file in sorted(folder.glob("*.dcm"))[number:]:
-            file.unlink()
-        noun = "1 slice;" if number == 1 else f"{number} slices;"
-        with pytest.raises(InputError, match=f"only {noun}"):
-            read_volume(folder)
-    shutil.copytree(dicom(tmp_path / "other"), folder / "other")
-    with pytest.raises(InputError, match=r"2 DICOM series .*1 slice of 4×5"):
-        _renumber(folder)
-        read_volume(folder)
-
-
-def _renumber(folder):
-    for file in (folder / "other").glob("*.dcm"):
-        slice_ = pydicom.dcmread(file)
-        slice_.SeriesNumber, slice_.SeriesInstanceUID = 2, "1.2.3.4"
-        slice_.save_as(file)
-
-
 _A = (RAMP > -20) & (RAMP < 20)
 _B = RAMP > 0
 
@@ -199,14 +158,6 @@ def test_overlapping_layers_are_chosen_by_name_or_number(tmp_path, values):
         read_volume(path)
 
 
-def test_layers_lie_where_the_header_puts_them(tmp_path):
-    path = _slicer(tmp_path / "seg.nrrd", [_A, _B], [("a", 0, 1), ("b", 1, 1)])
-    volume = read_mask(path, label="b").volume
-    np.testing.assert_allclose(volume.direction, TURN)
-    np.testing.assert_allclose(volume.spacing_mm, SPACING)
-    np.testing.assert_allclose(volume.origin_mm, ORIGIN)
-
-
 def test_segments_of_one_layer_have_names_too(tmp_path):
     path = _slicer(tmp_path / "seg.nrrd", _A * 1 + (~_A & _B) * 4, [("rca", 0, 1), ("lca", 0, 4), ("none", 0, 6)])
     for label in ("lca", 4, "4"):
@@ -216,17 +167,14 @@ def test_segments_of_one_layer_have_names_too(tmp_path):
 def test_a_segmentation_without_layers_has_a_segment_in_each(tmp_path):
     """Slicer before 4.11 wrote one component a segment, and neither layer nor value."""
     path = _slicer(tmp_path / "old.nrrd", [_A, _B], [("a", None, None), ("b", None, None)])
-    np.testing.assert_array_equal(read_mask(path, label="b").volume.voxels, _B)
-
-
-def test_the_one_segment_that_holds_voxels_needs_no_choice(tmp_path):
-    path = _slicer(tmp_path / "seg.nrrd", [_A * 0, _B * 1], [("a", 0, 1), ("b", 1, 1)])
-    np.testing.assert_array_equal(read_mask(path).volume.voxels, _B)
+    volume = read_mask(path, label="b").volume
+    np.testing.assert_array_equal(volume.voxels, _B)
+    np.testing.assert_allclose(volume.index_to_world(np.zeros(3)), ORIGIN)
+    alone = _slicer(tmp_path / "one.nrrd", [_A * 0, _B * 1], [("a", 0, 1), ("b", 1, 1)])
+    np.testing.assert_array_equal(read_mask(alone).volume.voxels, _B)  # the only one that holds voxels
 
 
 def test_two_segments_of_one_name_are_told_apart_by_number(tmp_path):
-    path = _slicer(tmp_path / "seg.nrrd", [_A, _B], [("v", 0, 1), ("v", 1, 2)], type="uint8")
-    path.write_bytes(path.read_bytes())
     with pytest.raises(InputError, match="2 segments are called v; choose one by number"):
         read_mask(_slicer(tmp_path / "seg.nrrd", [_A * 1, _B * 2], [("v", 0, 1), ("v", 1, 2)]), label="v")
 
@@ -287,14 +235,6 @@ def test_a_nifti_is_read_itself_beside_its_twin(tmp_path):
             assert read_volume(tmp_path / name).files == (tmp_path / name,)
 
 
-def test_the_hash_of_a_mask_is_that_of_the_file_read(tmp_path):
-    nifti(tmp_path / "v.nii.gz", voxels=(RAMP > 0).astype("<i2"))
-    nifti(tmp_path / "v.nii", voxels=(RAMP > 20).astype("<i2"))
-    source = read_source(tmp_path / "v.nii.gz")
-    assert source.sha256 == sha256(tmp_path / "v.nii.gz")
-    assert source.content.volume.voxels.sum() == (RAMP > 0).sum()
-
-
 @pytest.mark.parametrize("suffix", [".mhd", ".nhdr"])
 def test_the_hash_of_a_detached_header_covers_its_voxels(tmp_path, suffix):
     voxels = (RAMP > 0).astype("<i2").tobytes()
@@ -308,9 +248,3 @@ def test_the_hash_of_a_detached_header_covers_its_voxels(tmp_path, suffix):
     before = read_source(header).sha256
     (tmp_path / "v.raw").write_bytes((RAMP > 1).astype("<i2").tobytes())
     assert read_source(header).sha256 != before != sha256(header)
-
-
-def test_a_folder_in_place_of_the_voxels_is_refused(tmp_path):
-    (tmp_path / "v.raw").mkdir()
-    with pytest.raises(InputError, match=r"missing \(v.raw\)"):
-        read_volume(metaimage(tmp_path / "v.mhd", ElementDataFile="v.raw"))

@@ -17,9 +17,9 @@ from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import Polylines
 
 
-def made(lines, radius=1.5, **given):
-    source = Polylines(tuple(lines), tuple(np.full(len(line), radius) for line in lines))
-    return tree_from_polylines(source, given.get("ostium"), "lines.vtp", given.get("vessel", "generic"))
+def made(lines, radii=None, vessel="generic"):
+    sizes = tuple(np.full(len(line), size) for line, size in zip(lines, radii or [1.5] * len(lines), strict=True))
+    return tree_from_polylines(Polylines(tuple(lines), sizes), None, "lines.vtp", vessel)
 
 
 def helix(count=240):
@@ -32,19 +32,16 @@ def straight(first, last, count=100):
 
 
 def test_points_in_another_order_than_along_the_vessel_are_sorted():
-    line = helix()
-    found = made([line[np.random.default_rng(3).permutation(len(line))]])
-    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
-    assert abs(found.tree.longest_path().abscissa[-1] - length) < 0.5
-    assert any("in another order than along the vessel, and are sorted" in note for note in found.notes)
-
-
-def test_two_points_that_are_swapped_are_sorted():
     line = straight([0, 0, 0], [0, 0, 60], 121)
-    line[[40, 41]] = line[[41, 40]]
-    found = made([line])
-    assert abs(found.tree.longest_path().abscissa[-1] - 60) < 0.01
-    assert any("sorted (61 mm became 60 mm)" in note for note in found.notes)
+    swapped = line.copy()
+    swapped[[40, 41]] = line[[41, 40]]
+    for mixed, said in (
+        (swapped, "sorted (61 mm became 60 mm)"),
+        (line[np.random.default_rng(3).permutation(121)], "sorted"),
+    ):
+        found = made([mixed])
+        assert abs(found.tree.longest_path().abscissa[-1] - 60) < 0.5
+        assert any(said in note for note in found.notes)
 
 
 def test_points_in_no_order_are_refused_as_such_and_not_as_coarse():
@@ -59,17 +56,11 @@ def test_points_in_order_are_left_as_they_are(line):
     assert made([line]).notes == []
 
 
-def test_a_line_that_leads_there_and_back_is_one_vessel():
-    line = straight([0, 0, 0], [0, 0, 60])
-    found = made([np.concatenate([line, line[::-1]])])
-    assert len(found.tree.branches) == 1
-    assert abs(found.tree.longest_path().abscissa[-1] - 60) < 0.5
-
-
 def test_one_line_through_a_whole_tree_is_that_tree():
     trunk, branch = straight([0, 0, 0], [0, 0, 60], 121), straight([0, 0, 30], [20, 0, 60])
     found = made([np.concatenate([trunk, trunk[60:][::-1], branch])])
     assert len(found.tree.leaves()) == 2 and found.notes == []
+    assert len(made([np.concatenate([trunk, trunk[::-1]])]).tree.branches) == 1  # there and back
 
 
 @pytest.mark.parametrize("step_mm", [4.0, 9.0, 20.0])
@@ -115,13 +106,7 @@ def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
         end = np.array(start) + length * unit / np.linalg.norm(unit)
         lines.append(straight(start, end, max(2, int(length / radius))))
         radii.append(radius)
-    from endopilot.anatomy.tree import tree_from_polylines
-    from endopilot.vessels.sources import Polylines
-
-    source = Polylines(
-        tuple(lines), tuple(np.full(len(line), radius) for line, radius in zip(lines, radii, strict=True))
-    )
-    found = tree_from_polylines(source, None, "lines.vtp")
+    found = made(lines, radii)
     lengths = found.coverage
     total = sum(length for _, _, length, _ in pieces)
     assert abs(lengths["length_mm"] - total) < 0.3
@@ -156,11 +141,7 @@ def test_a_small_gap_between_lines_is_bridged_and_noted():
 
 
 def test_the_longer_of_two_pieces_is_taken_though_the_other_is_wider():
-    from endopilot.anatomy.tree import tree_from_polylines
-    from endopilot.vessels.sources import Polylines
-
-    lines = (straight([0, 0, 0], [0, 0, 90]), straight([40, 0, 0], [40, 0, 30]))
-    found = tree_from_polylines(Polylines(lines, (np.full(100, 1.0), np.full(100, 2.0))), None, "lines.vtp")
+    found = made([straight([0, 0, 0], [0, 0, 90]), straight([40, 0, 0], [40, 0, 30])], [1.0, 2.0])
     assert abs(found.tree.longest_path().abscissa[-1] - 90) < 0.5
 
 

@@ -182,23 +182,19 @@ STRAIGHT = line((0, 0, 0), (0, 0, 60))
 
 
 @pytest.mark.parametrize(
-    ("voxel_mm", "length_mm", "across"),
-    [((0.35, 0.35, 0.5), 1.0, 1), ((0.7, 0.7, 0.5), 2.0, 2), ((0.35, 0.35, 0.5), 6.0, 1), ((0.7, 0.7, 0.5), 6.0, 1)],
+    ("voxel_mm", "radius_mm", "length_mm", "across", "widened"),
+    [
+        ((0.35, 0.35, 0.5), 1.6, 1.0, 1, False),
+        ((0.7, 0.7, 0.5), 1.6, 6.0, 1, True),
+        ((0.45, 0.45, 0.45), 2.0, 1.5, 2, True),  # few voxels between wide faces
+    ],
 )
-def test_a_vessel_goes_on_behind_a_neck(voxel_mm, length_mm, across):
-    mask = thinned_at(tubes((STRAIGHT, 1.6), voxel_mm=voxel_mm), (0, 0, 30), length_mm, across)
+def test_a_vessel_goes_on_behind_a_neck(voxel_mm, radius_mm, length_mm, across, widened):
+    mask = thinned_at(tubes((STRAIGHT, radius_mm), voxel_mm=voxel_mm), (0.1, 0.1, 30), length_mm, across)
     anatomy = extract_anatomy(lumen(mask), name="neck")
     assert abs(length_of(anatomy) - 60.0) < 2.0
-    if length_mm > 2.0:
-        assert any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
-
-
-@pytest.mark.parametrize(("voxel_mm", "radius_mm", "across"), [(0.35, 1.2, 1), (0.45, 2.0, 1), (0.45, 2.0, 2)])
-def test_a_neck_of_few_voxels_between_wide_faces_is_widened_until_the_wall_carries_on(voxel_mm, radius_mm, across):
-    mask = thinned_at(tubes((STRAIGHT, radius_mm), voxel_mm=[voxel_mm] * 3), (0.1, 0.1, 30), 1.5, across)
-    anatomy = extract_anatomy(lumen(mask), name="neck")
-    assert abs(length_of(anatomy) - 60.0) < 2.0
-    assert any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
+    said = any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
+    assert said or not widened
 
 
 @pytest.mark.parametrize("voxel_mm", [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)])

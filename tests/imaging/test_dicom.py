@@ -130,8 +130,13 @@ def test_compressed_series_are_read_and_truncated_ones_refused(tmp_path, compres
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
+        ({"Modality": "MR"}, "modality MR"),
+        ({"SamplesPerPixel": 3}, "colour image"),
+        ({"NumberOfFrames": 4}, "multi-frame"),
+        ({"ImagePositionPatient": None}, "no ImagePositionPatient"),
         ({"RescaleSlope": None}, "no RescaleSlope"),
         ({"RescaleSlope": "0"}, "RescaleSlope is 0"),
+        ({"PhotometricInterpretation": "MONOCHROME1"}, "PhotometricInterpretation MONOCHROME1"),
         ({"PixelSpacing": ["0", "1"]}, "PixelSpacing gives voxels of 1×0"),
         ({"ImageOrientationPatient": ["1", "0", "0", "1", "0", "0"]}, "ImageOrientationPatient: .*not at right angles"),
         ({"ImageOrientationPatient": ["1", "0", "0"]}, "no ImageOrientationPatient"),
@@ -143,8 +148,9 @@ def test_empty_and_impossible_values_in_the_header(series, values, expected):
     if expected is None:
         assert read_volume(series).voxels.shape == (6, 7, 8)
         return
-    with pytest.raises(InputError, match=rf"slice-000\d.dcm: .*{expected}"):
+    with pytest.raises(InputError, match=rf"(slice-000\d.dcm|series): .*{expected}") as caught:
         read_volume(series)
+    _assert_no_identifier(str(caught.value))
 
 
 def test_a_header_field_that_is_no_number_is_refused_without_its_content(series):
@@ -156,13 +162,6 @@ def test_a_header_field_that_is_no_number_is_refused_without_its_content(series)
         read_volume(series)
     _assert_no_identifier(str(caught.value))
     assert caught.value.__cause__ is None
-
-
-def test_the_rescale_is_applied(series):
-    _change(series, RescaleSlope="2", RescaleIntercept="-24")
-    np.testing.assert_array_equal(read_volume(series).voxels, _oblique_ct().voxels * 2 - 24)
-    _change(series, RescaleSlope="0.5", RescaleIntercept="0")
-    np.testing.assert_allclose(read_volume(series).voxels, _oblique_ct().voxels * 0.5)
 
 
 def test_several_series_are_listed_and_one_is_chosen(series):
@@ -191,19 +190,10 @@ def test_bad_series_are_refused_in_one_line(series, tmp_path, caplog):
         _move(file, [0.0, 0.1 * k, 0.0])
     twice = copy("twice")
     shutil.copy(twice / "slice-0001.dcm", twice / "again.dcm")
-    magnet = copy("magnet")
-    _change(magnet, Modality="MR")
     few = copy("few")
     for file in sorted(few.glob("*.dcm"))[2:]:
         file.unlink()
-    mixed = copy("mixed")
-    _change(mixed, every=2, PixelSpacing=["1", "1"])
-    nowhere = copy("nowhere")
-    _change(nowhere, ImagePositionPatient=None)
-    colour = copy("colour")
-    _change(colour, SamplesPerPixel=3)
-    frames = copy("frames")
-    _change(frames, NumberOfFrames=4)
+    _change(copy("mixed"), every=2, PixelSpacing=["1", "1"])
     cut = copy("cut")
     content = (cut / "slice-0002.dcm").read_bytes()
     (cut / "slice-0002.dcm").write_bytes(content[:-60])
@@ -219,12 +209,8 @@ def test_bad_series_are_refused_in_one_line(series, tmp_path, caplog):
         "gap": "1 irregular slice distance.*1.50 mm instead of 0.75 mm.*slices are missing",
         "tilted": "off by 7.*gantry tilt",
         "twice": "several images at one slice position",
-        "magnet": "modality MR",
         "few": "only 2 slices",
         "mixed": "PixelSpacing differ",
-        "nowhere": "no ImagePositionPatient",
-        "colour": "colour image",
-        "frames": "multi-frame",
         "cut": "slice-0002.dcm: .*truncated",
         "header": "slice-0002.dcm|irregular",
         "compressed": "High-Throughput JPEG 2000.*not supported.*decompress",

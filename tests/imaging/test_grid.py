@@ -9,8 +9,8 @@ from scipy import ndimage
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
 from endopilot.imaging.contour import lumen_at_half_height
-from endopilot.imaging.grid import dilated
 from endopilot.imaging.overlay_picture import draw_overlay
+from endopilot.imaging.voxels import dilated
 from endopilot.types import LumenMask, Volume
 
 

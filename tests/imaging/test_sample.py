@@ -63,12 +63,6 @@ def test_the_sample_is_fetched_once_and_its_licence_printed(index, tmp_path, cap
     assert "Apache-2.0" in capsys.readouterr().err
 
 
-def test_a_damaged_copy_is_fetched_again(index):
-    fetch_sample().write_bytes(b"damaged")
-    assert fetch_sample().read_bytes() == b"the CT"
-    assert len(index["asked"]) == 2
-
-
 def test_no_network_is_reported_in_one_line_and_leaves_nothing(index, tmp_path):
     index["archive"] = b""
     with pytest.raises(

@@ -16,6 +16,7 @@ from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.types import Volume
 
 _METHOD = """
+from dataclasses import replace
 import numpy as np
 from endopilot.imaging.segment import SegmentationMethod
 from endopilot.types import Insertion, LumenMask, Volume
@@ -36,23 +37,23 @@ def voxels(volume, config):
 def coarse(volume, config):
     return LumenMask(Volume(volume.voxels[::2] > 200, volume.spacing_mm, volume.origin_mm, volume.direction))
 
+def changed(volume, ostium=None, **grid):
+    return LumenMask(replace(volume, voxels=volume.voxels > 200, **grid), ostium)
+
 def moved(volume, config):
-    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm + 3.0, volume.direction))
+    return changed(volume, origin_mm=volume.origin_mm + 3.0)
 
 def coarser(volume, config):
-    return LumenMask(Volume(volume.voxels > 200, 1.2 * volume.spacing_mm, volume.origin_mm, volume.direction))
+    return changed(volume, spacing_mm=1.2 * volume.spacing_mm)
 
 def turned(volume, config):
-    turn = np.diag([-1.0, -1.0, 1.0])
-    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction @ turn))
+    return changed(volume, direction=volume.direction @ np.diag([-1.0, -1.0, 1.0]))
 
 def lost(volume, config):
-    nowhere = Insertion(np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0, 1.0]))
-    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction), nowhere)
+    return changed(volume, Insertion(np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0, 1.0])))
 
 def flat(volume, config):
-    nowhere = Insertion(np.zeros(3), np.zeros(3))
-    return LumenMask(Volume(volume.voxels > 200, volume.spacing_mm, volume.origin_mm, volume.direction), nowhere)
+    return changed(volume, Insertion(np.zeros(3), np.zeros(3)))
 
 words = "no method"
 """
@@ -167,10 +168,6 @@ def test_contrast_is_found_by_the_histogram(plain_method):
     enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner
         segment(enhanced, config=config)
-
-
-def test_importing_the_stage_loads_no_method():
-    assert not hasattr(segmentation, "MCP_Geometric")
 
 
 _TOTALSEGMENTATOR = """

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import struct
 import subprocess
 import sys
 
@@ -43,27 +42,14 @@ def test_a_volume_survives_writing_and_reading(tmp_path, suffix):
     np.testing.assert_allclose(again.direction, volume.direction, atol=1e-5)
 
 
-def test_a_fraction_of_a_hu_is_kept(tmp_path):
-    write_volume(_oblique_volume(np.float32), tmp_path / "ct.nrrd")
-    assert read_volume(tmp_path / "ct.nrrd").voxels.dtype == np.float32
-
-
-def test_a_four_dimensional_file_with_one_phase_is_read(tmp_path):
-    sitk.WriteImage(_image(np.zeros((1, 4, 5, 6), np.int16), isVector=False), tmp_path / "one.nii.gz")
-    assert read_volume(tmp_path / "one.nii.gz").voxels.shape == (4, 5, 6)
-
-
 def test_bad_volumes_are_refused_in_one_line(tmp_path):
     sitk.WriteImage(_image(np.zeros((3, 4, 5, 6), np.int16), isVector=False), tmp_path / "four.nii.gz")
+    sitk.WriteImage(_image(np.zeros((1, 4, 5, 6), np.int16), isVector=False), tmp_path / "one.nii.gz")
+    assert read_volume(tmp_path / "one.nii.gz").voxels.shape == (4, 5, 6)
     sitk.WriteImage(_image(np.zeros((4, 5, 6, 3), np.uint8), isVector=True), tmp_path / "rgb.nrrd")
     sitk.WriteImage(_image(np.zeros((6, 6), np.int16)), tmp_path / "slice.mha")
-    write_volume(_oblique_volume(), tmp_path / "whole.nii.gz")
-    write_volume(_oblique_volume(), tmp_path / "whole.nii")
-    write_volume(_oblique_volume(), tmp_path / "whole.mha")
-    write_volume(_oblique_volume(), tmp_path / "whole.nrrd")
-    for suffix in ("nii.gz", "nii", "mha", "nrrd"):
-        content = (tmp_path / f"whole.{suffix}").read_bytes()
-        (tmp_path / f"cut.{suffix}").write_bytes(content[: len(content) - len(content) // 3])
+    write_volume(_oblique_volume(), tmp_path / "cut.nii.gz")
+    (tmp_path / "cut.nii.gz").write_bytes((tmp_path / "cut.nii.gz").read_bytes()[:-60])
     (tmp_path / "text.nii.gz").write_bytes(gzip.compress(b"not an image"))
     (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff")
     nan = _oblique_volume(np.float32)
@@ -76,18 +62,14 @@ def test_bad_volumes_are_refused_in_one_line(tmp_path):
         "rgb.nrrd": "3 values in every voxel",
         "slice.mha": "no volume",
         "cut.nii.gz": "truncated or damaged",
-        "cut.nii": "truncated or damaged",
-        "cut.mha": "truncated or damaged",
-        "cut.nrrd": "truncated or damaged",
         "text.nii.gz": "does not match its suffix",
         "photo.jpg": "unknown format",
         "nan.nrrd": "not finite",
         "empty": "no DICOM image",
     }.items():
-        with pytest.raises(InputError, match=expected) as caught:
+        with pytest.raises(InputError, match=rf"{name}: .*{expected}") as caught:
             read_volume(tmp_path / name)
         assert "\n" not in str(caught.value)
-        assert name in str(caught.value)
 
 
 def test_series_is_only_for_dicom(tmp_path):
@@ -304,38 +286,6 @@ def test_label_maps_are_not_taken_for_grey_masks(tmp_path):
         with pytest.raises(InputError, match=r"labels \(-1, 1, 2"):
             read_mask(tmp_path / "labels.nrrd")
         np.testing.assert_array_equal(read_mask(tmp_path / "labels.nrrd", label=2).volume.voxels, labels == 2)
-
-
-def _with_extensions(path, *extensions: tuple[int, bytes], order: str = "<") -> None:
-    """Write labels 7 and 51 as NIfTI-1 with header extensions, each of a kind and a content."""
-    labels = np.zeros((5, 6, 7), np.uint8)
-    labels[1:3], labels[3:] = 7, 51
-    parts = [struct.pack(f"{order}2i", len(content) + 8, kind) + content for kind, content in extensions]
-    header = bytearray(348)
-    struct.pack_into(f"{order}i", header, 0, 348)
-    struct.pack_into(f"{order}8h", header, 40, 3, 7, 6, 5, 1, 1, 1, 1)
-    struct.pack_into(f"{order}2h", header, 70, 2, 8)
-    struct.pack_into(f"{order}4f", header, 76, 1, 1, 1, 1)
-    struct.pack_into(f"{order}2f", header, 108, 352 + sum(map(len, parts)), 1)
-    header[123] = 2
-    struct.pack_into(f"{order}h", header, 254, 1)
-    struct.pack_into(f"{order}12f", header, 280, *np.eye(3, 4).ravel())
-    header[344:348] = b"n+1\0"
-    path.write_bytes(bytes(header) + b"\1\0\0\0" + b"".join(parts) + labels.tobytes())
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_the_names_of_labels_in_a_nifti_extension_are_read(tmp_path, order):
-    names = b'<CaretExtension><VolumeInformation><LabelTable><Label Red="1" Key="7">left &amp; right</Label>'
-    names += b'<Label Key="51"><![CDATA[heart]]></Label><Label Key="9">absent</Label></LabelTable></VolumeInformation>'
-    names += b"</CaretExtension>\0\0\0\0"
-    _with_extensions(tmp_path / "a.nii", (4, b"x" * 24), (30, names), order=order)
-    with pytest.raises(InputError, match=r"2 labels \(7 \(left & right\), 51 \(heart\)\)"):
-        read_mask(tmp_path / "a.nii")
-    assert read_mask(tmp_path / "a.nii", label="Heart").volume.voxels.sum() == 84
-    for content in (b"<Label Key='7'>no end", b"<a><Label Key='x'>seven</Label></a>", b"\xff" * 16):
-        _with_extensions(tmp_path / "b.nii", (30, content), order=order)
-        assert read_mask(tmp_path / "b.nii", label=51).volume.voxels.sum() == 84
 
 
 _OF_ARRAYS = """

@@ -208,17 +208,6 @@ def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):
     assert np.median(at(volume, right.points[inside][:40])) > 300
 
 
-def test_plaques_of_the_circumflex_lie_on_it(left):
-    lad, lcx = phantom.chest.main_paths(left.tree)
-    spot = {"abscissa_mm": 40.0, "length_mm": 8.0, "diameter_reduction": 0.4, "vessel": "LCx"}
-    grid = phantom._field_of_view(left, COARSE)
-    (plaque,) = phantom._plaques(grid, replace(left, provenance={"stenoses": [spot]}), np.random.default_rng(0), 0.0)
-    k, j, i = np.unravel_index(plaque.depth.argmax(), plaque.depth.shape)
-    centre = [grid.x[plaque.box[2]][i], grid.y[plaque.box[1]][j], grid.z[plaque.box[0]][k]]
-    assert np.linalg.norm(lcx.points - centre, axis=1).min() < 1.5
-    assert np.linalg.norm(lad.points - centre, axis=1).min() > 5.0
-
-
 def test_fit_recovers_a_moved_heart():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     course = curve_through(TO_CRUX)

@@ -44,8 +44,7 @@ from endopilot.vessels.sources import (
     transformed,
     unit_name,
 )
-from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, distance_map_from_surface, surface_from_mask
 from endopilot.vessels.topology import parted, touch_remarks
 
 CORONARY_RADIUS_MM = 1.6  # mean radius of a coronary tree at most, for the grid where the aorta is there too
@@ -160,6 +159,9 @@ def extract_anatomy(
         radius = config.catheter_radius_mm or min(resolved, ostium_radius)
         distance_map = add_catheter(distance_map, insertion, radius)
         advance()
+    dominant = None if short else dominance(tree)
+    if inlet is not None and inlet.other is not None:
+        dominant = None if inlet.crux is None else inlet.crux.dominance
     provenance = {
         "endopilot": __version__,
         "source": _source_record(wrapped),
@@ -167,7 +169,7 @@ def extract_anatomy(
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
-        "dominance": _dominance(tree, inlet, short),
+        "dominance": dominant,
         "coverage": balance,
         "notes": [_understood(tree, wrapped, config.coordinates), *doubts, *notes],
     }
@@ -227,12 +229,6 @@ def _other_side(tree: VesselTree, vessel: str) -> list[str]:
         f"the vessel runs as a {found} coronary artery does: {off[other]:.0f}° from the usual course of one, "
         f"{off[vessel]:.0f}° from that of the {asked} one; check --vessel, and the axes of the file"
     ]
-
-
-def _dominance(tree: VesselTree, inlet: CoronaryInlet | None, short: list[str]) -> str | None:
-    if inlet is not None and inlet.other is not None:
-        return None if inlet.crux is None else inlet.crux.dominance
-    return None if short else dominance(tree)
 
 
 def _source_record(source: AnatomySource) -> dict[str, str | None]:

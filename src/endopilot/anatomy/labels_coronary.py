@@ -194,8 +194,9 @@ def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
     tree = labeller.tree
     # The circumflex keeps to the groove, round the back; the marginals leave it to the left.
     supplies = labeller.crux is not None and labeller.crux.dominance != "right"
-    if supplies:
-        leaf = min(tree.leaves(branch), key=lambda index: _from_crux(labeller, index))
+    if labeller.crux is not None and supplies:
+        crux = labeller.crux.position
+        leaf = min(tree.leaves(branch), key=lambda i: np.linalg.norm(tree.path(i).points - crux, axis=1).min())
     else:
         leaf = max(tree.leaves(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
     route = labeller.onwards(branch, leaf)
@@ -223,8 +224,3 @@ def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
         return np.inf if passed is None or labeller.crux.dominance == "right" else passed
     turn = float(line.abscissa[(line.points @ GROOVE).argmax()])
     return turn if _turns_forwards(line, turn, BEYOND_CRUX_MM) else np.inf
-
-
-def _from_crux(labeller: Labeller, leaf: int) -> float:
-    assert labeller.crux is not None
-    return float(np.linalg.norm(labeller.tree.path(leaf).points - labeller.crux.position, axis=1).min())

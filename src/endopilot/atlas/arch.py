@@ -15,7 +15,6 @@ Carotids and subclavian arteries are cut off in the neck and the armpit.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,10 +22,9 @@ from jaxtyping import Float
 from endopilot.anatomy.labels_tree import ARCH_SECTIONS
 from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.population import Population, vessel_data
+from endopilot.atlas.population import Draw, Drawn, vessel_data
 from endopilot.atlas.variation import bent, varied
 from endopilot.lines import length_along
-from endopilot.types import VesselTree
 
 HEIGHT_MM, WIDTH_MM = {"man": 49.3, "woman": 40.1}, {"man": 83.6, "woman": 73.3}
 TYPE_SHARES = {"I": 0.607, "II": 0.343, "III": 0.05}
@@ -46,45 +44,41 @@ TRUNK_MM = (38.2, 9.5)
 _DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0  # aorta before and behind the arch, from mid-chest and to the root
 
 
-def make_arch(
-    generator: np.random.Generator, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
+def make_arch(draw: Draw) -> Drawn:
     """Return one aortic arch and what was drawn for it; a stenosis lies in a carotid or the left subclavian artery."""
-    sex = "man" if generator.random() < 0.5 else "woman"
-    kind = str(generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values())))
-    bovine = bool(generator.random() < BOVINE_SHARE)
-    return branching.until_it_fits(
-        partial(_draw, generator, sex, kind, bovine, stenosis_share, population), "aortic arch"
+    sex = "man" if draw.generator.random() < 0.5 else "woman"
+    kind = str(
+        draw.generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values()))
     )
+    bovine = bool(draw.generator.random() < BOVINE_SHARE)
+    return branching.until_it_fits(partial(_draw, draw, sex, kind, bovine), "aortic arch")
 
 
-def _draw(
-    generator: np.random.Generator, sex: str, kind: str, bovine: bool, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
-    size = branching.truncated(generator, 1.0, 0.08, 0.8, 1.2)
+def _draw(draw: Draw, sex: str, kind: str, bovine: bool) -> Drawn:
+    size = branching.truncated(draw, 1.0, 0.08, 0.8, 1.2)
     height, width = size * HEIGHT_MM[sex], size * WIDTH_MM[sex]
     wide = {
-        name: branching.truncated(generator, mean, sd, mean - 2 * sd, mean + 2 * sd)
+        name: branching.truncated(draw, mean, sd, mean - 2 * sd, mean + 2 * sd)
         for name, (mean, sd) in DIAMETER_MM.items()
     }
-    points = _aorta(generator, height, width)
+    points = _aorta(draw, height, width)
     low, high = {"I": (0.1, 1.0), "II": (1.0, 2.0), "III": (2.0, 2.9)}[kind]
-    drop = wide["left common carotid"] * float(generator.uniform(low, high))
-    origins = _origins(generator, points, drop, wide, bovine)
+    drop = wide["left common carotid"] * float(draw.generator.uniform(low, high))
+    origins = _origins(draw, points, drop, wide, bovine)
     first, last = origins["left subclavian"], origins["brachiocephalic trunk"]
     along, place = length_along(points), np.arange(len(points))
     marks = along[[0, first - 60, first, (first + last) // 2, last, last + 60, -1]]
-    radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * branching.uneven(generator, along)
-    radius = radius * branching.truncated(generator, 1.0, 0.13, 0.7, 1.3)
+    radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * branching.uneven(draw, along)
+    radius = radius * branching.truncated(draw, 1.0, 0.13, 0.7, 1.3)
     section = np.select([place <= first, place <= last], ARCH_SECTIONS[:2], default=ARCH_SECTIONS[2]).tolist()
-    vessels = [branching.Vessel(bent(generator, points, radius, population), radius, section)]
-    plans = varied(generator, _plans(generator, vessels[0], origins, wide, bovine), population)
-    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
+    vessels = [branching.Vessel(bent(draw, points, radius), radius, section)]
+    plans = varied(draw, _plans(draw, vessels[0], origins, wide, bovine))
+    vessels = branching.with_side_branches(draw, vessels, plans)
     narrow = []
-    if generator.random() < stenosis_share:
-        where = str(generator.choice(["left common carotid", "left subclavian", "right common carotid"]))
+    if draw.generator.random() < draw.stenosis_share:
+        where = str(draw.generator.choice(["left common carotid", "left subclavian", "right common carotid"]))
         index = [vessel.section[-1] for vessel in vessels].index(where)
-        narrow, vessels = branching.narrowed(generator, vessels, index, (0.4, 0.8), population.tandem_share)
+        narrow, vessels = branching.narrowed(draw, vessels, index, (0.4, 0.8))
     drawn = {
         "arch_type": kind,
         "bovine": bovine,
@@ -97,21 +91,21 @@ def _draw(
     return branching.build_tree(vessels, ARCH_SECTIONS), drawn
 
 
-def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
+def _aorta(draw: Draw, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
     turn = np.linspace(np.pi, 0.0, 24)
     across, up = 0.5 * width_mm * np.cos(turn), height_mm * np.sin(turn)
     down, root = np.linspace(-_DESCENDING_MM, -8.0, 12), np.linspace(-8.0, -_ASCENDING_MM, 5)
     across = np.concatenate([np.full(12, across[0]), across, np.full(5, across[-1])])
     up = np.concatenate([down, up, root])
-    angle = np.deg2rad(branching.truncated(generator, 50.3, 13.8, 22.0, 78.0))
+    angle = np.deg2rad(branching.truncated(draw, 50.3, 13.8, 22.0, 78.0))
     forwards = np.array([-np.sin(angle), -np.cos(angle), 0.0])
     points = across[:, None] * forwards + up[:, None] * np.array([0.0, 0.0, 1.0])
     line = shape.curve_through(points)
-    return branching.wiggled(generator, line, (1.5, 4.0), quiet_mm=30.0, wavelengths_mm=(60.0, 160.0))
+    return branching.wiggled(draw, line, (1.5, 4.0), quiet_mm=30.0, wavelengths_mm=(60.0, 160.0))
 
 
 def _origins(
-    generator: np.random.Generator,
+    draw: Draw,
     points: Float[np.ndarray, "n 3"],
     drop_mm: float,
     wide: dict[str, float],
@@ -125,7 +119,7 @@ def _origins(
     for name, (mean, sd) in GAP_MM.items():
         if bovine and name == "left common carotid":
             continue
-        gap = branching.truncated(generator, mean, sd, 0.5, mean + 2 * sd)
+        gap = branching.truncated(draw, mean, sd, 0.5, mean + 2 * sd)
         away = gap + 0.5 * (wide[before] + wide[name])
         origins[name], before = origins[before] - round(away / shape.STEP_MM), name
     if points[origins["left subclavian"], 2] < 0.2 * points[top, 2]:
@@ -134,7 +128,7 @@ def _origins(
 
 
 def _plans(
-    generator: np.random.Generator,
+    draw: Draw,
     aorta: branching.Vessel,
     origins: dict[str, int],
     wide: dict[str, float],
@@ -159,14 +153,14 @@ def _plans(
         )
 
     trunk = "brachiocephalic trunk"
-    length = branching.truncated(generator, *TRUNK_MM, 24.0, 58.0)
+    length = branching.truncated(draw, *TRUNK_MM, 24.0, 58.0)
     wall = float(aorta.radius[origins[trunk]])
     plans = [plan(trunk, wide[trunk], 0, origins[trunk], wall + length, 0.1)]
     for name in ("left common carotid", "left subclavian", "right common carotid", "right subclavian"):
         diameter = wide.get(name, 0.0) or DIAMETER_MM_BEYOND[name] * wide[trunk] / DIAMETER_MM[trunk][0]
         parent, origin = (0, origins[name]) if name in origins else (1, -1)
         if name == "left common carotid" and bovine:
-            parent, origin = 1, round((wall + float(generator.uniform(3.0, 12.0))) / shape.STEP_MM)
+            parent, origin = 1, round((wall + float(draw.generator.uniform(3.0, 12.0))) / shape.STEP_MM)
         reach = data["length_mm"][name] + (wall if parent == 0 else 0.0)
-        plans.append(plan(name, diameter, parent, origin, reach * float(generator.uniform(0.9, 1.1)), 0.2))
+        plans.append(plan(name, diameter, parent, origin, reach * float(draw.generator.uniform(0.9, 1.1)), 0.2))
     return plans

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import model_validator
@@ -13,16 +13,16 @@ from endopilot.anatomy.distance import CATHETER_RADIUS_MM
 from endopilot.atlas.arch import make_arch
 from endopilot.atlas.cerebral import make_cerebral
 from endopilot.atlas.lca import make_lca
-from endopilot.atlas.population import Population, PopulationName, population_of
+from endopilot.atlas.population import Draw, Drawn, PopulationName, population_of
 from endopilot.atlas.portal import make_portal
 from endopilot.atlas.rca import make_rca
 from endopilot.atlas.variation import catheter_direction, flattened
 from endopilot.settings import Seed, Share, Within, settings
-from endopilot.types import Anatomy, Insertion, VesselTree
+from endopilot.types import Anatomy, Insertion
 
 CATHETER_LENGTH_MM = 30.0  # length of catheter behind the ostium that the distance map holds, mm
 
-_KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[VesselTree, dict[str, Any]]]] = {
+_KINDS: dict[str, Callable[[Draw], Drawn]] = {
     "rca": make_rca,
     "lca": make_lca,
     "cerebral": make_cerebral,
@@ -68,12 +68,11 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     """Return patient `index`, made from its exact centerline and radii; `provenance` holds what was drawn. The random
     stream is keyed by (seed, index), so that a patient does not depend on the others."""
     tree, drawn = make_patient_tree(config, index)
-    population = population_of(config.vessel, config.population)
-    generator = _stream(config, index, 1)
+    draw = _draw(config, index, 1)
     name, source = f"{config.vessel}-{config.seed}-{index:04d}", {"source": "atlas", "vessel": config.vessel}
     source |= {"population": config.population, "seed": config.seed, "index": index}
-    direction, catheter = catheter_direction(generator, tree, population, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM)
-    lumen = distance.distance_map_from_spheres(tree, beside=flattened(generator, tree, population))
+    direction, catheter = catheter_direction(draw, tree, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM)
+    lumen = distance.distance_map_from_spheres(tree, beside=flattened(draw, tree))
     insertion = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
     return Anatomy(
         name=name,
@@ -85,13 +84,14 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     )
 
 
-def make_patient_tree(config: AtlasConfig, index: int) -> tuple[VesselTree, dict[str, Any]]:
+def make_patient_tree(config: AtlasConfig, index: int) -> Drawn:
     """Return the centerline tree of patient `index`, and what was drawn for it, without a distance map."""
-    population = population_of(config.vessel, config.population)
-    return _KINDS[config.vessel](_stream(config, index, 0), config.stenosis_share, population)
+    return _KINDS[config.vessel](_draw(config, index, 0))
 
 
-def _stream(config: AtlasConfig, index: int, purpose: int) -> np.random.Generator:
-    """Return a patient's random stream for the tree (0), or for section and catheter (1)."""
+def _draw(config: AtlasConfig, index: int, purpose: int) -> Draw:
+    """Return what a patient is drawn with, its random stream that for the tree (0), or for section and catheter (1)."""
     key = np.array([config.seed, index], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key, counter=np.array([0, 0, 0, purpose], dtype=np.uint64)))
+    stream = np.random.Philox(key=key, counter=np.array([0, 0, 0, purpose], dtype=np.uint64))
+    population = population_of(config.vessel, config.population)
+    return Draw(np.random.Generator(stream), config.stenosis_share, population)

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from endopilot.atlas import curves as shape
+from endopilot.atlas.population import Courses, Draw, Drawn
 from endopilot.lines import length_along
 from endopilot.types import Branch, Centerline, VesselTree
 
@@ -40,7 +41,7 @@ class Vessel:
     origin: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SidePlan:
     """A side branch to be drawn.
 
@@ -53,19 +54,17 @@ class SidePlan:
     """
 
     section: str
-    parent: int = 0
     origin: int
     length_mm: float
     diameter_mm: float
-    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+    courses: Courses
+    parent: int = 0
     taper: float = 0.3
     angle_deg: tuple[float, float] = (40.0, 70.0)
     depth: Depth | None = field(default=None, compare=False)
 
 
-def until_it_fits(
-    draw: Callable[[], tuple[VesselTree, dict[str, Any]]], what: str
-) -> tuple[VesselTree, dict[str, Any]]:
+def until_it_fits(draw: Callable[[], Drawn], what: str) -> Drawn:
     """Draw trees until one fits, whose record states how many failed (`redrawn`); NoShape after 60 draws."""
     for attempt in range(60):
         try:
@@ -76,10 +75,10 @@ def until_it_fits(
     raise NoShape(f"no {what} found in 60 draws")
 
 
-def truncated(generator: np.random.Generator, mean: float, sd: float, low: float, high: float) -> float:
+def truncated(draw: Draw, mean: float, sd: float, low: float, high: float) -> float:
     """Draw from a normal distribution cut off at both ends."""
     while True:
-        value = generator.normal(mean, sd)
+        value = draw.generator.normal(mean, sd)
         if low <= value <= high:
             return float(value)
 
@@ -89,52 +88,52 @@ def coronary_dominance(u: float) -> str:
     return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
 
 
-def coronary_calibre(generator: np.random.Generator, mean: float, low: float, high: float) -> float:
+def coronary_calibre(draw: Draw, mean: float, low: float, high: float) -> float:
     """Draw a patient's coronary lumen against the average, by sex."""
-    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
-    return float(np.clip(mean * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), low, high))
+    sex = _FEMALE_CALIBRE if draw.generator.random() < 0.5 else 1.0
+    return float(np.clip(mean * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * draw.generator.normal()), low, high))
 
 
-def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, taken: Sequence[int]) -> int:
+def free_origin(draw: Draw, mean_mm: float, sd_mm: float, taken: Sequence[int]) -> int:
     """Draw the index of a branch's origin, 3 mm or more from the vessel's start and from other origins."""
     while True:
-        drawn = truncated(generator, mean_mm, sd_mm, max(mean_mm - 2 * sd_mm, 3.0), mean_mm + 2 * sd_mm)
+        drawn = truncated(draw, mean_mm, sd_mm, max(mean_mm - 2 * sd_mm, 3.0), mean_mm + 2 * sd_mm)
         origin = round(drawn / shape.STEP_MM)
         if all(abs(origin - other) * shape.STEP_MM >= 3.0 for other in taken):
             return origin
 
 
 def stenosis(
-    generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float]
+    draw: Draw, along: Float[np.ndarray, "n"], shares: tuple[float, float]
 ) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
     """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm within `shares`, and the radius's factor."""
-    place, extent = along[0] + generator.uniform(*shares) * (along[-1] - along[0]), generator.uniform(6.0, 14.0)
-    degree = generator.uniform(0.3, 0.65)
+    place = along[0] + draw.generator.uniform(*shares) * (along[-1] - along[0])
+    extent, degree = draw.generator.uniform(6.0, 14.0), draw.generator.uniform(0.3, 0.65)
     narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
     drawn = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
     return drawn, narrowing
 
 
 def stenoses(
-    generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float], tandem_share: float
+    draw: Draw, along: Float[np.ndarray, "n"], shares: tuple[float, float]
 ) -> tuple[list[dict[str, Any]], Float[np.ndarray, "n"]]:
     """Return a stenosis, by `tandem_share` a second one 12 to 40 mm from it where there is room, and their factor."""
-    drawn, narrowing = stenosis(generator, along, shares)
-    if tandem_share == 0 or generator.random() > tandem_share:
+    tandem_share = draw.population.tandem_share
+    drawn, narrowing = stenosis(draw, along, shares)
+    if tandem_share == 0 or draw.generator.random() > tandem_share:
         return [drawn], narrowing
     for _ in range(10):
-        second, also = stenosis(generator, along, shares)
+        second, also = stenosis(draw, along, shares)
         if 12.0 < abs(second["abscissa_mm"] - drawn["abscissa_mm"]) < 40.0:
             return [drawn, second], narrowing * also
     return [drawn], narrowing
 
 
 def narrowed(
-    generator: np.random.Generator,
+    draw: Draw,
     vessels: Sequence[Vessel],
     index: int,
     shares: tuple[float, float],
-    tandem_share: float = 0.0,
 ) -> tuple[list[dict[str, Any]], list[Vessel]]:
     """Return the stenoses of one vessel (abscissa from the ostium, and section), and the vessels with them; the mouths
     of its branches, which lie in its lumen, narrow with it."""
@@ -144,7 +143,7 @@ def narrowed(
         parent = vessels[above.parent]
         along = along + length_along(parent.points)[above.origin]
         above = parent
-    drawn, factor = stenoses(generator, along, shares, tandem_share)
+    drawn, factor = stenoses(draw, along, shares)
     found = [one | {"section": vessel.section[int(np.searchsorted(along, one["abscissa_mm"]))]} for one in drawn]
     changed = []
     for i, other in enumerate(vessels):
@@ -157,7 +156,7 @@ def narrowed(
 
 
 def wiggled(
-    generator: np.random.Generator,
+    draw: Draw,
     points: Float[np.ndarray, "n 3"],
     amplitude_mm: tuple[float, float],
     *,
@@ -165,30 +164,28 @@ def wiggled(
     wavelengths_mm: tuple[float, float] = (13.0, 60.0),
 ) -> Float[np.ndarray, "m 3"]:
     """Return an evenly spaced curve with a smooth random displacement; its first `quiet_mm` fade in."""
-    wiggle = shape.Wiggle.draw(generator, *wavelengths_mm)
+    wiggle = shape.Wiggle.draw(draw.generator, *wavelengths_mm)
     normals = shape.parallel_normals(shape.tangents(points))
-    moved = wiggle.apply(points, normals, generator.uniform(*amplitude_mm), quiet_mm)
+    moved = wiggle.apply(points, normals, draw.generator.uniform(*amplitude_mm), quiet_mm)
     return shape.curve_through(moved[::4])
 
 
-def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def uneven(draw: Draw, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return the factor on a lumen's radius by which real vessels vary along their length: waves of 2.5 %."""
-    wavelength = generator.uniform(15.0, 60.0, 4)
-    waves = np.sin(2 * np.pi * along[:, None] / wavelength + generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
+    wavelength = draw.generator.uniform(15.0, 60.0, 4)
+    waves = np.sin(2 * np.pi * along[:, None] / wavelength + draw.generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
     return 1 + 0.025 * waves
 
 
-def with_side_branches(
-    generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan], carina_mm: float
-) -> list[Vessel]:
+def with_side_branches(draw: Draw, vessels: Sequence[Vessel], plans: Sequence[SidePlan]) -> list[Vessel]:
     """Return the vessels with the planned branches, drawn up to twelve times until none cuts another lumen; over
     `carina_mm` behind a fork and twice their radii they may touch. Raises NoShape where a branch found no place."""
-    grown = list(vessels)
+    grown, carina_mm = list(vessels), draw.population.carina_mm
     if not plans and lumens_collide(grown, carina_mm):
         raise NoShape
     for plan in plans:
         for _ in range(12):
-            side = _side_branch(generator, grown[plan.parent], plan)
+            side = _side_branch(draw, grown[plan.parent], plan)
             if not lumens_collide([*grown, side], carina_mm):
                 grown.append(side)
                 break
@@ -197,18 +194,20 @@ def with_side_branches(
     return grown
 
 
-def _side_branch(generator: np.random.Generator, parent: Vessel, plan: SidePlan) -> Vessel:
+def _side_branch(draw: Draw, parent: Vessel, plan: SidePlan) -> Vessel:
     origin = plan.origin % len(parent.points)
     start, wide = parent.points[origin], float(parent.radius[origin])
-    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
+    turn = Rotation.from_rotvec(np.deg2rad(draw.generator.normal(0, 12, 3)))
     headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in plan.courses]
     forward = shape.tangents(parent.points)[origin]
     across = headed[0][1] - (headed[0][1] @ forward) * forward
-    angle = np.deg2rad(generator.uniform(*plan.angle_deg))
+    angle = np.deg2rad(draw.generator.uniform(*plan.angle_deg))
     direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
-    points = shape.steer(start, direction, headed, plan.length_mm, generator.uniform(6.0, 9.0), plan.depth)
+    points = shape.steer(start, direction, headed, plan.length_mm, draw.generator.uniform(6.0, 9.0), plan.depth)
     across = shape.parallel_normals(shape.tangents(points))
-    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, across, generator.uniform(0.3, 0.8), 10.0)
+    points = shape.Wiggle.draw(draw.generator, 13.0, 45.0, 6).apply(
+        points, across, draw.generator.uniform(0.3, 0.8), 10.0
+    )
     points = shape.curve_through(points[:: max(len(points) // 24, 1)])
     points = np.concatenate([start[None], points[1:]])
     lumen = 0.5 * plan.diameter_mm * (1 - plan.taper * np.linspace(0.0, 1.0, len(points)))

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,10 +24,9 @@ from scipy.ndimage import gaussian_filter1d
 from endopilot.anatomy.labels_tree import CEREBRAL_SECTIONS
 from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.population import Population, vessel_data
+from endopilot.atlas.population import Draw, Drawn, vessel_data
 from endopilot.atlas.variation import Fork, bent, factor, forks_of, varied
 from endopilot.lines import length_along
-from endopilot.types import VesselTree
 
 SIPHON_MM, SIPHON_SD_MM = 33.1, 6.1
 M1_MM, M1_SD_MM = 22.5, 8.1
@@ -47,45 +45,43 @@ _PCOM_SHARE = 0.6  # share of patients with a visible posterior communicating ar
 _SHARPEST_PER_MM = 0.4  # greatest curvature of the carotid's axis, 1/mm: its wall must not fold
 
 
-def make_cerebral(
-    generator: np.random.Generator, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
+def make_cerebral(draw: Draw) -> Drawn:
     """Return one side's anterior circulation and what was drawn for it; a stenosis lies in M1 or the carotid artery."""
-    side = "left" if generator.random() < 0.5 else "right"
-    trunks = 3 if generator.random() < TRIFURCATION_SHARE else 2
-    siphon = branching.truncated(generator, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)
-    m1 = branching.truncated(generator, M1_MM, M1_SD_MM, 7.0, 38.0)
-    draw = partial(_draw, generator, side, trunks, siphon, m1, stenosis_share, population)
-    return branching.until_it_fits(draw, "cerebral arteries")
+    side = "left" if draw.generator.random() < 0.5 else "right"
+    trunks = 3 if draw.generator.random() < TRIFURCATION_SHARE else 2
+    siphon = branching.truncated(draw, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)
+    m1 = branching.truncated(draw, M1_MM, M1_SD_MM, 7.0, 38.0)
+    fresh = partial(_draw, draw, side, trunks, siphon, m1)
+    return branching.until_it_fits(fresh, "cerebral arteries")
 
 
 def _draw(
-    generator: np.random.Generator,
+    draw: Draw,
     side: str,
     trunks: int,
     siphon_mm: float,
     m1_mm: float,
-    stenosis_share: float,
-    population: Population,
-) -> tuple[VesselTree, dict[str, Any]]:
-    points, marks = _main(generator, siphon_mm, m1_mm)
-    radius, calibre = _radius(generator, points, marks)
+) -> Drawn:
+    points, marks = _main(draw, siphon_mm, m1_mm)
+    radius, calibre = _radius(draw, points, marks)
     place = np.arange(len(points))
     section = np.select([place <= marks["terminus"], place <= marks["M2"]], ["ICA", "M1"], default="M2 inferior")
-    a1_mm = branching.truncated(generator, A1_MM, 3.0, *A1_RANGE_MM)
-    plans = varied(generator, _plans(generator, marks, a1_mm, calibre, trunks, population), population)
-    plans, forks = _opened_trunks(generator, plans, population)
-    points = bent(generator, points, radius, population, forks=forks)
+    a1_mm = branching.truncated(draw, A1_MM, 3.0, *A1_RANGE_MM)
+    plans = varied(draw, _plans(draw, marks, a1_mm, calibre, trunks))
+    plans, forks = _opened_trunks(draw, plans)
+    points = bent(draw, points, radius, forks=forks)
     vessels = [branching.Vessel(points, radius, section.tolist())]
-    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
+    vessels = branching.with_side_branches(draw, vessels, plans)
     narrow = []
-    if generator.random() < stenosis_share:
+    if draw.generator.random() < draw.stenosis_share:
         low, high = (
-            (marks["cavernous"], marks["terminus"]) if generator.random() < 0.5 else (marks["terminus"], marks["M2"])
+            (marks["cavernous"], marks["terminus"])
+            if draw.generator.random() < 0.5
+            else (marks["terminus"], marks["M2"])
         )
         low, high = low + 0.2 * (high - low), high - 0.2 * (high - low)
         shares = (low / len(points), high / len(points))
-        narrow, vessels = branching.narrowed(generator, vessels, 0, shares, population.tandem_share)
+        narrow, vessels = branching.narrowed(draw, vessels, 0, shares)
     whole = {vessel.section[-1]: index for index, vessel in enumerate(vessels)}
     aca = vessels[whole["A1"]]
     beyond = length_along(aca.points) > a1_mm
@@ -107,19 +103,17 @@ def _draw(
     return branching.build_tree(vessels, CEREBRAL_SECTIONS), drawn
 
 
-def _main(
-    generator: np.random.Generator, siphon_mm: float, m1_mm: float
-) -> tuple[Float[np.ndarray, "n 3"], dict[str, int]]:
+def _main(draw: Draw, siphon_mm: float, m1_mm: float) -> tuple[Float[np.ndarray, "n 3"], dict[str, int]]:
     """Return carotid, M1 and the inferior trunk of M2 in one line, and where on it each begins."""
-    before = _TO_SIPHON + generator.normal(0, 0.8, _TO_SIPHON.shape)
-    knees = _SIPHON + generator.normal(0, 1.0, _SIPHON.shape) * np.array([0.5, 1.0, 1.0])
-    lateral = np.array([0.96, float(generator.normal(0, 0.15)), float(generator.normal(0.15, 0.15))])
+    before = _TO_SIPHON + draw.generator.normal(0, 0.8, _TO_SIPHON.shape)
+    knees = _SIPHON + draw.generator.normal(0, 1.0, _SIPHON.shape) * np.array([0.5, 1.0, 1.0])
+    lateral = np.array([0.96, float(draw.generator.normal(0, 0.15)), float(draw.generator.normal(0.15, 0.15))])
     lateral = lateral / np.linalg.norm(lateral)
-    bow = float(generator.normal(0.0, 0.08)) * m1_mm * np.array([0.0, 0.3, 1.0])
+    bow = float(draw.generator.normal(0.0, 0.08)) * m1_mm * np.array([0.0, 0.3, 1.0])
     m1 = m1_mm * np.array([0.4, 0.75, 1.0])[:, None] * lateral + np.array([0.8, 0.9, 0.0])[:, None] * bow
-    m2 = m1[-1] + _BEYOND_M1 + generator.normal(0, 1.0, _BEYOND_M1.shape)
-    wiggle = shape.Wiggle.draw(generator, 13.0, 45.0)
-    amplitude, stretch = float(generator.uniform(0.2, 0.6)), np.ones(2)
+    m2 = m1[-1] + _BEYOND_M1 + draw.generator.normal(0, 1.0, _BEYOND_M1.shape)
+    wiggle = shape.Wiggle.draw(draw.generator, 13.0, 45.0)
+    amplitude, stretch = float(draw.generator.uniform(0.2, 0.6)), np.ones(2)
     points, marks = knees, dict[str, int]()
     for _ in range(4):
         # Siphon and M1 take their lengths from the draw; what lies before and behind keeps its own.
@@ -144,23 +138,22 @@ def _rounded(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _radius(
-    generator: np.random.Generator, points: Float[np.ndarray, "n 3"], marks: dict[str, int]
+    draw: Draw, points: Float[np.ndarray, "n 3"], marks: dict[str, int]
 ) -> tuple[Float[np.ndarray, "n"], float]:
-    calibre = branching.truncated(generator, 1.0, 0.12, 0.72, 1.3)
+    calibre = branching.truncated(draw, 1.0, 0.12, 0.72, 1.3)
     place = [0, marks["cavernous"], marks["terminus"], marks["terminus"] + 5, marks["M2"], marks["M2"] + 5, len(points)]
     wide = DIAMETER_MM
     diameter = [4.8, wide["cavernous"], wide["terminus"], wide["M1"], 2.8, wide["M2"], 1.5]
     own = np.interp(np.arange(len(points)), place, diameter)
-    return 0.5 * calibre * own * branching.uneven(generator, length_along(points)), calibre
+    return 0.5 * calibre * own * branching.uneven(draw, length_along(points)), calibre
 
 
 def _plans(
-    generator: np.random.Generator,
+    draw: Draw,
     marks: dict[str, int],
     a1_mm: float,
     calibre: float,
     trunks: int,
-    population: Population,
 ) -> list[branching.SidePlan]:
     origins = {
         "A1": marks["terminus"],
@@ -170,13 +163,13 @@ def _plans(
         "PCom": (marks["ophthalmic"] + marks["terminus"]) // 2,
     }
     lengths = {"A1": a1_mm + 55.0, "M2 superior": 42.0, "M2 middle": 36.0, "ophthalmic": 26.0, "PCom": 16.0}
-    presence = factor(generator, population.side_share)
+    presence = factor(draw, draw.population.side_share)
     shares = {"M2 middle": float(trunks == 3), "PCom": _PCOM_SHARE * presence, "ophthalmic": 1.0}
     if presence < 1:
         shares["ophthalmic"] = presence
     plans = []
     for name, origin in origins.items():
-        if generator.random() >= shares.get(name, 1.0):
+        if draw.generator.random() >= shares.get(name, 1.0):
             continue
         courses = vessel_data("cerebral")["courses"][name]
         begins = [begin + a1_mm - A1_MM if name == "A1" and begin else begin for begin, _ in courses]
@@ -185,8 +178,8 @@ def _plans(
             branching.SidePlan(
                 section=name,
                 origin=origin,
-                length_mm=lengths[name] * float(generator.uniform(0.85, 1.15)),
-                diameter_mm=own * branching.truncated(generator, 1.0, 0.1, 0.7, 1.3),
+                length_mm=lengths[name] * float(draw.generator.uniform(0.85, 1.15)),
+                diameter_mm=own * branching.truncated(draw, 1.0, 0.1, 0.7, 1.3),
                 courses=tuple((begin, course) for begin, (_, course) in zip(begins, courses, strict=True)),
                 angle_deg=(38.0, 58.0) if name.startswith("M2") else (60.0, 90.0),
             )
@@ -194,16 +187,14 @@ def _plans(
     return plans
 
 
-def _opened_trunks(
-    generator: np.random.Generator, plans: list[branching.SidePlan], population: Population
-) -> tuple[list[branching.SidePlan], list[Fork]]:
+def _opened_trunks(draw: Draw, plans: list[branching.SidePlan]) -> tuple[list[branching.SidePlan], list[Fork]]:
     """Return the plans and where the main line gives way; the inferior trunk of M2, which goes on from M1, and the
     superior one each take half of the population's angle."""
     forks = forks_of(plans, 0)
-    if population.trunks_angle_deg is None:
+    if draw.population.trunks_angle_deg is None:
         return plans, forks
-    mean, sd, low, high = population.trunks_angle_deg
-    half = 0.5 * branching.truncated(generator, mean, sd, low, high)
+    mean, sd, low, high = draw.population.trunks_angle_deg
+    half = 0.5 * branching.truncated(draw, mean, sd, low, high)
     at = next(place for place, plan in enumerate(plans) if plan.section == "M2 superior")
     plans = [*plans[:at], replace(plans[at], angle_deg=(half - 4.0, half + 4.0)), *plans[at + 1 :]]
     own = Fork(plans[at].origin, plans[at].courses[0][1], half)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -24,10 +23,9 @@ from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import FORK, INFERIOR, LAD, LCX, HeartFit, fit_left_heart
-from endopilot.atlas.population import Population, SideKind, side_kinds
+from endopilot.atlas.population import Draw, Drawn, SideKind, side_kinds
 from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
 from endopilot.lines import length_along
-from endopilot.types import VesselTree
 
 LEFT_MAIN_MM, LEFT_MAIN_SD_MM, LEFT_MAIN_DIAMETER_MM = 13.1, 3.5, 4.5
 LAD_DIAMETER_MM = {0.0: 3.7, 0.06: 3.6, 0.24: 2.5, 0.58: 1.7, 0.79: 1.4, 0.84: 1.25, 1.0: 1.1}
@@ -81,42 +79,38 @@ class _Trunk:
         return fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
 
 
-def make_lca(
-    generator: np.random.Generator, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
+def make_lca(draw: Draw) -> Drawn:
     """Return one left coronary tree and what was drawn for it; a stenosis lies in either of its main branches."""
-    dominance = branching.coronary_dominance(generator.random())
+    dominance = branching.coronary_dominance(draw.generator.random())
     # Drawn once, so that shapes that fail do not bias it.
-    main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)
-    draw = partial(_draw, generator, dominance, main_mm, stenosis_share, population)
-    return branching.until_it_fits(draw, "left coronary artery")
+    main_mm = None if draw.population.left_main_mm is None else drawn_from(draw, draw.population.left_main_mm)
+    fresh = partial(_draw, draw, dominance, main_mm)
+    return branching.until_it_fits(fresh, "left coronary artery")
 
 
-def _draw(
-    generator: np.random.Generator, dominance: str, main_mm: float | None, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
-    trunk = _trunk(generator, dominance, main_mm, population)
-    calibre = branching.coronary_calibre(generator, 1.0, 0.65, 1.4)
-    lad = _lad(generator, trunk, calibre)
-    flare = factor(generator, population.left_main_flare) - 1
+def _draw(draw: Draw, dominance: str, main_mm: float | None) -> Drawn:
+    trunk = _trunk(draw, dominance, main_mm)
+    calibre = branching.coronary_calibre(draw, 1.0, 0.65, 1.4)
+    lad = _lad(draw, trunk, calibre)
+    flare = factor(draw, draw.population.left_main_flare) - 1
     if flare:
         away = (length_along(trunk.lad) - shape.STEP_MM * trunk.fork) / _FLARE_MM
         lad = replace(lad, radius=lad.radius * (1 + flare * np.exp(-(away**2))))
-    wide, widening = ectasia(generator, length_along(trunk.lad), population)
+    wide, widening = ectasia(draw, length_along(trunk.lad))
     lad = replace(lad, radius=lad.radius * widening)
-    vessels, narrow = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
-    plans = varied(generator, _plan_branches(generator, trunk, vessels, dominance, calibre, population), population)
-    trunk = _bent(generator, trunk, vessels, plans, population)
+    vessels, narrow = [lad, _lcx(draw, trunk, lad, dominance, calibre)], []
+    plans = varied(draw, _plan_branches(draw, trunk, vessels, dominance, calibre))
+    trunk = _bent(draw, trunk, vessels, plans)
     heart = trunk.heart()
     plans = [plan if plan.section == "septal" else replace(plan, depth=heart.solid_depth) for plan in plans]
     vessels = [replace(vessels[0], points=trunk.lad), replace(vessels[1], points=trunk.lcx)]
     vessels = _with_sections(trunk, vessels, plans, dominance)
     lad = vessels[0]
-    if generator.random() < stenosis_share:
+    if draw.generator.random() < draw.stenosis_share:
         fork = trunk.fork / len(lad.points)
-        which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
-        narrow, vessels = branching.narrowed(generator, vessels, which, shares, population.tandem_share)
-    vessels = branching.with_side_branches(generator, vessels, plans, population.carina_mm)
+        which, shares = (0, (fork + 0.06, 0.65)) if draw.generator.random() < 0.6 else (1, (0.15, 0.6))
+        narrow, vessels = branching.narrowed(draw, vessels, which, shares)
+    vessels = branching.with_side_branches(draw, vessels, plans)
     tree = branching.build_tree(vessels, LCA_SECTIONS)
     along, bends = length_along(lad.points), shape.curvature(lad.points)
     drawn = {
@@ -140,33 +134,33 @@ def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     return shape.curve_through(LAD, 1.0), shape.curve_through(lcx, 1.0)
 
 
-def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None, population: Population) -> _Trunk:
+def _trunk(draw: Draw, dominance: str, main_mm: float | None) -> _Trunk:
     """Return the main vessels: the mean courses, sized, turned, moved with the left main's end, and wiggling."""
-    size = float(np.exp(_SIZE_SD * np.clip(generator.normal(), -2.5, 2.5)))
-    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, _TURN_SD_DEG, 3)))
+    size = float(np.exp(_SIZE_SD * np.clip(draw.generator.normal(), -2.5, 2.5)))
+    turn = Rotation.from_rotvec(np.deg2rad(draw.generator.normal(0, _TURN_SD_DEG, 3)))
     if main_mm is None:
-        main_mm = branching.truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
+        main_mm = branching.truncated(draw, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
     lad, lcx = ((template - template[0]) * size for template in _templates())
     end_of_main = main_mm * FORK / np.linalg.norm(FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
     stride = round(6.0 * size)
     lad = branching.wiggled(
-        generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
+        draw, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
     )
     fork = round(main_mm / shape.STEP_MM)
     crux_at = (LCX[-1] - FORK) * size
-    lcx = branching.wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
+    lcx = branching.wiggled(draw, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
-    if population.left_main_turns_deg is not None:
+    if draw.population.left_main_turns_deg is not None:
         wide = 0.5 * LEFT_MAIN_DIAMETER_MM
-        lad, lcx = opened_fork(generator, lad, lcx, fork, wide, population.left_main_turns_deg)
+        lad, lcx = opened_fork(draw, lad, lcx, fork, wide, draw.population.left_main_turns_deg)
     if dominance == "left":
-        end_mm = shape.STEP_MM * crux + size * branching.truncated(generator, 48.0, 10.0, 28.0, 68.0)
+        end_mm = shape.STEP_MM * crux + size * branching.truncated(draw, 48.0, 10.0, 28.0, 68.0)
     else:
-        end_mm = size * branching.truncated(generator, *_ENDS[dominance])
+        end_mm = size * branching.truncated(draw, *_ENDS[dominance])
     # The anterior descending artery ends before, at or beyond the apex.
-    last = fork + round((len(lad) - 1 - fork) * generator.uniform(0.74, 1.0))
+    last = fork + round((len(lad) - 1 - fork) * draw.generator.uniform(0.74, 1.0))
     trunk = _Trunk(lad, lcx, (last + 1, round(end_mm / shape.STEP_MM) + 1), fork, crux, size, turn)
     if max(shape.curvature(trunk.lad).max(), shape.curvature(trunk.lcx).max()) > _SHARPEST_PER_MM:
         raise branching.NoShape
@@ -174,13 +168,12 @@ def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None
 
 
 def _bent(
-    generator: np.random.Generator,
+    draw: Draw,
     trunk: _Trunk,
     vessels: Sequence[branching.Vessel],
     plans: Sequence[branching.SidePlan],
-    population: Population,
 ) -> _Trunk:
-    if not population.bends_vessels:
+    if not draw.population.bends_vessels:
         return trunk
     beyond = round(2.5 * float(vessels[0].radius[trunk.fork]) / shape.STEP_MM)
     bent_lines = []
@@ -188,11 +181,11 @@ def _bent(
         radius = vessels[index].radius
         radius = np.concatenate([radius, np.full(max(len(line) - len(radius), 0), radius[-1])])[: len(line)]
         forks = [fork for fork in forks_of(plans, index) if fork.index > first]
-        bent_lines.append(bent(generator, line, radius, population, forks=forks, first=first))
+        bent_lines.append(bent(draw, line, radius, forks=forks, first=first))
     return replace(trunk, whole_lad=bent_lines[0], whole_lcx=bent_lines[1])
 
 
-def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> branching.Vessel:
+def _lad(draw: Draw, trunk: _Trunk, calibre: float) -> branching.Vessel:
     along = length_along(trunk.lad)
     beyond = along - along[trunk.fork]
     whole = trunk.size * float(length_along(_templates()[0])[-1])
@@ -200,56 +193,53 @@ def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> branc
     # The left main's lumen changes into that of the anterior descending artery just behind the fork.
     share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
     diameter = LEFT_MAIN_DIAMETER_MM + (own - LEFT_MAIN_DIAMETER_MM) * share**2 * (3 - 2 * share)
-    return branching.Vessel(trunk.lad, 0.5 * diameter * calibre * branching.uneven(generator, along), ())
+    return branching.Vessel(trunk.lad, 0.5 * diameter * calibre * branching.uneven(draw, along), ())
 
 
-def _lcx(
-    generator: np.random.Generator, trunk: _Trunk, lad: branching.Vessel, dominance: str, calibre: float
-) -> branching.Vessel:
+def _lcx(draw: Draw, trunk: _Trunk, lad: branching.Vessel, dominance: str, calibre: float) -> branching.Vessel:
     along = length_along(trunk.lcx)
     profile = LCX_DIAMETER_MM[dominance]
     own = PchipInterpolator(list(profile), list(profile.values()))(along / along[-1])
-    radius = np.minimum(0.5 * own * calibre * branching.uneven(generator, along), lad.radius[trunk.fork])
+    radius = np.minimum(0.5 * own * calibre * branching.uneven(draw, along), lad.radius[trunk.fork])
     forward = shape.tangents(trunk.lad)[trunk.fork]
     radius = branching.mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
     return branching.Vessel(trunk.lcx, radius, (), 0, trunk.fork)
 
 
 def _plan_branches(
-    generator: np.random.Generator,
+    draw: Draw,
     trunk: _Trunk,
     vessels: list[branching.Vessel],
     dominance: str,
     calibre: float,
-    population: Population,
 ) -> list[branching.SidePlan]:
     plans: list[branching.SidePlan] = []
-    presence = factor(generator, population.side_share)
+    presence = factor(draw, draw.population.side_share)
     for parent, kinds in enumerate((side_kinds("lca", "lad"), side_kinds("lca", "lcx"))):
         first = trunk.fork if parent == 0 else 0
         taken: list[int] = []
         for name, kind in kinds.items():
-            if generator.random() > kind.share * presence or (name == "14 posterior" and dominance == "right"):
+            if draw.generator.random() > kind.share * presence or (name == "14 posterior" and dominance == "right"):
                 continue
             mean, sd = (trunk.size * value for value in kind.origin_mm)
-            origin = first + branching.free_origin(generator, mean, sd, taken)
+            origin = first + branching.free_origin(draw, mean, sd, taken)
             if origin * shape.STEP_MM > length_along(vessels[parent].points)[-1] - 8.0:
                 continue
             taken.append(origin - first)
-            plans.append(_plan(generator, name.split()[0], kind, parent, origin, trunk, calibre))
+            plans.append(_plan(draw, name.split()[0], kind, parent, origin, trunk, calibre))
         own = sorted(
             (plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=lambda plan: plan.origin
         )
         named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
         plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
     ramus = side_kinds("lca", "ramus")["17"]
-    if generator.random() < ramus.share:
-        plans.insert(0, _plan(generator, "17", ramus, 0, trunk.fork, trunk, calibre))
+    if draw.generator.random() < ramus.share:
+        plans.insert(0, _plan(draw, "17", ramus, 0, trunk.fork, trunk, calibre))
     return plans
 
 
 def _plan(
-    generator: np.random.Generator,
+    draw: Draw,
     section: str,
     kind: SideKind,
     parent: int,
@@ -263,8 +253,8 @@ def _plan(
         section=section,
         parent=parent,
         origin=origin,
-        length_mm=trunk.size * branching.truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
-        diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal())),
+        length_mm=trunk.size * branching.truncated(draw, mean, sd, 0.5 * mean, 1.5 * mean),
+        diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(draw.generator.normal())),
         courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
         angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
     )

@@ -14,7 +14,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from endopilot.files import read_yaml
+from endopilot.types import VesselTree
 
 PopulationName = Literal["patients", "textbook"]
 
@@ -77,6 +80,18 @@ class Population:
     def bends_vessels(self) -> bool:
         """Whether main vessels are bent at all beyond the textbook's courses."""
         return self.waves_deg[1] > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """What one patient is drawn with: a random stream, the share of patients with a stenosis, and how patients vary."""
+
+    generator: np.random.Generator
+    stenosis_share: float
+    population: Population
+
+
+Drawn = tuple[VesselTree, dict[str, Any]]  # a tree, and what was drawn for it
 
 
 @dataclass(frozen=True, kw_only=True)

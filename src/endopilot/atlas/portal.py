@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,10 +24,9 @@ from scipy.spatial.transform import Rotation
 from endopilot.anatomy.labels_tree import PORTAL_SECTIONS
 from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
-from endopilot.atlas.population import Population, vessel_data
+from endopilot.atlas.population import Draw, Drawn, vessel_data
 from endopilot.atlas.variation import Fork, bent, varied
 from endopilot.lines import length_along
-from endopilot.types import VesselTree
 
 MAIN_MM, MAIN_SD_MM = 78.0, 9.0
 MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM = 12.0, 1.3
@@ -44,45 +42,41 @@ _SEGMENT_DIAMETER_MM = 5.0
 _SHARPEST_PER_MM = 0.15  # greatest curvature of the widest line, 1/mm: its wall must not fold
 
 
-def make_portal(
-    generator: np.random.Generator, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
+def make_portal(draw: Draw) -> Drawn:
     """Return one portal vein and what was drawn for it; a stenosis lies in the main, right or left portal vein."""
     shares = np.array(list(VARIANT_SHARES.values()))
-    variant = str(generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
-    length = branching.truncated(generator, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
-    draw = partial(_draw, generator, variant, length, stenosis_share, population)
-    return branching.until_it_fits(draw, "portal vein")
+    variant = str(draw.generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
+    length = branching.truncated(draw, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
+    fresh = partial(_draw, draw, variant, length)
+    return branching.until_it_fits(fresh, "portal vein")
 
 
-def _draw(
-    generator: np.random.Generator, variant: str, main_mm: float, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
-    size = branching.truncated(generator, 1.0, 0.1, 0.8, 1.2)
-    points, hilum = _main(generator, main_mm, size)
-    right_mm = size * branching.truncated(generator, RIGHT_MM, RIGHT_SD_MM, 12.0, 30.0)
+def _draw(draw: Draw, variant: str, main_mm: float) -> Drawn:
+    size = branching.truncated(draw, 1.0, 0.1, 0.8, 1.2)
+    points, hilum = _main(draw, main_mm, size)
+    right_mm = size * branching.truncated(draw, RIGHT_MM, RIGHT_SD_MM, 12.0, 30.0)
     left, posterior = hilum, hilum
     if variant == "bifurcation":
         posterior = hilum + round(right_mm / shape.STEP_MM)
     elif variant == "right posterior first":
         left = hilum + round(0.7 * right_mm / shape.STEP_MM)
-    anterior = max(left, posterior) + round(size * float(generator.uniform(12.0, 18.0)) / shape.STEP_MM)
-    diameter = branching.truncated(generator, MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM, 9.0, 15.0)
+    anterior = max(left, posterior) + round(size * float(draw.generator.uniform(12.0, 18.0)) / shape.STEP_MM)
+    diameter = branching.truncated(draw, MAIN_DIAMETER_MM, MAIN_DIAMETER_SD_MM, 9.0, 15.0)
     calibre = diameter / MAIN_DIAMETER_MM
     radius = 0.5 * calibre * _profile(len(points), left, posterior, anterior)
-    radius = radius * branching.uneven(generator, length_along(points))
+    radius = radius * branching.uneven(draw, length_along(points))
     origins = {"LPV": left, "RPPV": posterior, "S5": anterior}
     forks = [Fork(origin, vessel_data("portal")["courses"][name][0][1]) for name, origin in origins.items()]
-    points = bent(generator, points, radius, population, forks=forks)
+    points = bent(draw, points, radius, forks=forks)
     place = np.arange(len(points))
     ends = [place <= left, place <= posterior, place <= anterior]
     vessels = [branching.Vessel(points, radius, np.select(ends, ["MPV", "RPV", "RAPV"], default="S8").tolist())]
-    vessels = _grown(generator, vessels, origins, size, calibre, population)
+    vessels = _grown(draw, vessels, origins, size, calibre)
     narrow = []
-    if generator.random() < stenosis_share:
+    if draw.generator.random() < draw.stenosis_share:
         share = hilum / len(points)
-        which, shares = (0, (0.3 * share, 0.8 * share)) if generator.random() < 0.6 else (1, (0.3, 0.5))
-        narrow, vessels = branching.narrowed(generator, vessels, which, shares, population.tandem_share)
+        which, shares = (0, (0.3 * share, 0.8 * share)) if draw.generator.random() < 0.6 else (1, (0.3, 0.5))
+        narrow, vessels = branching.narrowed(draw, vessels, which, shares)
     drawn = {
         "variant": variant,
         "main_length_mm": float(length_along(points)[min(left, posterior)]),
@@ -92,12 +86,12 @@ def _draw(
     return branching.build_tree(vessels, PORTAL_SECTIONS), drawn
 
 
-def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
-    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 8, 3)))
+def _main(draw: Draw, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:
+    turn = Rotation.from_rotvec(np.deg2rad(draw.generator.normal(0, 8, 3)))
     main = _COURSE * main_mm / length_along(shape.curve_through(_COURSE))[-1]
     right = main[-1] + size * turn.apply(_RIGHT)
     points = shape.curve_through(np.concatenate([main, right]))
-    points = branching.wiggled(generator, points, (0.8, 2.2), quiet_mm=25.0, wavelengths_mm=(25.0, 80.0))
+    points = branching.wiggled(draw, points, (0.8, 2.2), quiet_mm=25.0, wavelengths_mm=(25.0, 80.0))
     if shape.curvature(points).max() > _SHARPEST_PER_MM:
         raise branching.NoShape
     return points, round(main_mm / shape.STEP_MM)
@@ -114,12 +108,11 @@ def _profile(count: int, left: int, posterior: int, anterior: int) -> Float[np.n
 
 
 def _grown(
-    generator: np.random.Generator,
+    draw: Draw,
     vessels: list[branching.Vessel],
     origins: dict[str, int],
     size: float,
     calibre: float,
-    population: Population,
 ) -> list[branching.Vessel]:
     """Return the vessels with left and right posterior branch, then their segments' veins, then those of segment 5."""
 
@@ -130,33 +123,29 @@ def _grown(
             section=name,
             parent=parent,
             origin=origin,
-            length_mm=size * length_mm * float(generator.uniform(0.9, 1.1)),
-            diameter_mm=calibre * diameter_mm * branching.truncated(generator, 1.0, 0.08, 0.8, 1.2),
+            length_mm=size * length_mm * float(draw.generator.uniform(0.9, 1.1)),
+            diameter_mm=calibre * diameter_mm * branching.truncated(draw, 1.0, 0.08, 0.8, 1.2),
             courses=vessel_data("portal")["courses"][name],
             taper=taper,
             angle_deg=(55.0, 80.0) if name == "LPV" else (40.0, 65.0),
         )
 
     length_mm = vessel_data("portal")["length_mm"]
-    transverse = branching.truncated(generator, LEFT_MM, LEFT_SD_MM, 24.0, 46.0)
+    transverse = branching.truncated(draw, LEFT_MM, LEFT_SD_MM, 24.0, 46.0)
     large = [
         plan("LPV", 0, origins["LPV"], transverse + 18.0, 8.5, 0.35),
         plan("RPPV", 0, origins["RPPV"], 62.0, 7.5, 0.5),
         plan("S5", 0, origins["S5"], length_mm["S5"], _SEGMENT_DIAMETER_MM, 0.4),
     ]
-    vessels = branching.with_side_branches(
-        generator, vessels, varied(generator, large, population), population.carina_mm
-    )
+    vessels = branching.with_side_branches(draw, vessels, varied(draw, large))
     turn = round(size * transverse / shape.STEP_MM)
-    low = round(size * float(generator.uniform(22.0, 28.0)) / shape.STEP_MM)
+    low = round(size * float(draw.generator.uniform(22.0, 28.0)) / shape.STEP_MM)
     places = {"S2": (1, min(turn, len(vessels[1].points) - 20)), "S4": (1, -1), "S3": (1, -1), "S6": (2, low)}
     plans = [
         plan(name, parent, place, length_mm[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()
     ]
-    vessels = branching.with_side_branches(
-        generator, vessels, varied(generator, plans, population), population.carina_mm
-    )
+    vessels = branching.with_side_branches(draw, vessels, varied(draw, plans))
     posterior = vessels[2]
     names = np.where(np.arange(len(posterior.points)) <= low, "RPPV", "S7").tolist()
     vessels[2] = replace(posterior, section=names)

@@ -24,10 +24,9 @@ from endopilot.anatomy.labels_tree import RCA_SECTIONS
 from endopilot.atlas import branching
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
-from endopilot.atlas.population import Courses, Population, side_kinds, vessel_data
+from endopilot.atlas.population import Draw, Drawn, side_kinds, vessel_data
 from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
 from endopilot.lines import length_along
-from endopilot.types import VesselTree
 
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
@@ -47,55 +46,49 @@ class _Targets:
     ends_in: str
 
 
-def make_rca(
-    generator: np.random.Generator, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
+def make_rca(draw: Draw) -> Drawn:
     """Return one right coronary tree and its draws; targets stay when a shape fails, for failures would bias them."""
     for _ in range(10):
-        targets = _targets(generator)
-        draw = partial(_draw, generator, targets, stenosis_share, population)
+        targets = _targets(draw)
+        fresh = partial(_draw, draw, targets)
         with suppress(branching.NoShape):
-            return branching.until_it_fits(draw, "right coronary artery")
+            return branching.until_it_fits(fresh, "right coronary artery")
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 
-def _targets(generator: np.random.Generator) -> _Targets:
-    dominance = branching.coronary_dominance(generator.random())
+def _targets(draw: Draw) -> _Targets:
+    dominance = branching.coronary_dominance(draw.generator.random())
     if dominance == "left":
         # A small right coronary ends before the crux.
-        length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
+        length, ends_in = 112.0 + abs(float(draw.generator.normal(0, 10))), "3"
     else:
         # The mean makes up for the shorter left-dominant arteries.
-        length = branching.truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
-        ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
+        length = branching.truncated(draw, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        ends_in = "4" if dominance == "balanced" or draw.generator.random() < 0.6 else "16"
     return _Targets(
         dominance=dominance,
         length_mm=length,
-        tortuosity=branching.truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
-        curvature_per_mm=branching.truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        tortuosity=branching.truncated(draw, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=branching.truncated(draw, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
         ends_in=ends_in,
     )
 
 
-def _draw(
-    generator: np.random.Generator, targets: _Targets, stenosis_share: float, population: Population
-) -> tuple[VesselTree, dict[str, Any]]:
-    main, crux = _main_vessel(generator, targets)
-    healthy, calibre = _main_radius(generator, targets.dominance, main)
+def _draw(draw: Draw, targets: _Targets) -> Drawn:
+    main, crux = _main_vessel(draw, targets)
+    healthy, calibre = _main_radius(draw, targets.dominance, main)
     radius, narrow = healthy, []
-    if generator.random() < stenosis_share:
-        narrow, narrowing = branching.stenoses(generator, length_along(main), (0.12, 0.75), population.tandem_share)
+    if draw.generator.random() < draw.stenosis_share:
+        narrow, narrowing = branching.stenoses(draw, length_along(main), (0.12, 0.75))
         radius = healthy * narrowing
-    wide, widening = ectasia(generator, length_along(main), population)
+    wide, widening = ectasia(draw, length_along(main))
     radius = radius * widening
-    plans = varied(generator, _plan_branches(generator, healthy, crux, targets, calibre, population), population)
-    main = bent(generator, main, radius, population, forks=forks_of(plans, 0))
+    plans = varied(draw, _plan_branches(draw, healthy, crux, targets, calibre))
+    main = bent(draw, main, radius, forks=forks_of(plans, 0))
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
     plans = [replace(plan, depth=heart.solid_depth) for plan in plans]
     vessels = [branching.Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
-    tree = branching.build_tree(
-        branching.with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS
-    )
+    tree = branching.build_tree(branching.with_side_branches(draw, vessels, plans), RCA_SECTIONS)
     bends = shape.curvature(main)
     drawn = {
         "dominance": targets.dominance,
@@ -109,7 +102,7 @@ def _draw(
     return tree, drawn
 
 
-def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
+def _main_vessel(draw: Draw, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
     """Return the path from the ostium to the farthest tip, and the index of the crux on it. Size, closure of the C and
     amplitude of the wiggles are solved for so that length, tortuosity and mean curvature take the drawn values."""
     length, ends_in = targets.length_mm, targets.ends_in
@@ -121,11 +114,11 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
         keep = 0.97 * along[-1]
     else:
         # Long arteries reach farther beyond the crux rather than belong to huge hearts.
-        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
+        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * draw.generator.normal())
         keep = min(template_crux * length / crux_mm, along[-1])
     template = template[along <= keep]
-    wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
-    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
+    wiggle = shape.Wiggle.draw(draw.generator, 13.0, 70.0)
+    turn = Rotation.from_rotvec(np.deg2rad(draw.generator.normal(0, 7, 3)))
     centred = TO_CRUX - TO_CRUX.mean(axis=0)
     axis = np.linalg.svd(centred)[2][2]
     axis = axis * np.sign(axis @ np.cross(TO_CRUX[4] - TO_CRUX[0], TO_CRUX[-1] - TO_CRUX[4]))
@@ -152,15 +145,13 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
     return points, crux
 
 
-def _main_radius(
-    generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], float]:
-    calibre = branching.coronary_calibre(generator, _CALIBRE[dominance], 0.55, 1.4)
+def _main_radius(draw: Draw, dominance: str, main: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], float]:
+    calibre = branching.coronary_calibre(draw, _CALIBRE[dominance], 0.55, 1.4)
     share = np.linspace(0.0, 1.0, len(main))
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":
         diameter = diameter * (1 - 0.2 * share)
-    return 0.5 * diameter * calibre * branching.uneven(generator, length_along(main)), calibre
+    return 0.5 * diameter * calibre * branching.uneven(draw, length_along(main)), calibre
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
@@ -172,34 +163,27 @@ def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> l
 
 
 def _plan_branches(
-    generator: np.random.Generator,
+    draw: Draw,
     radius: Float[np.ndarray, "n"],
     crux: int,
     targets: _Targets,
     calibre: float,
-    population: Population,
 ) -> list[branching.SidePlan]:
     plans: list[branching.SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
-    presence = factor(generator, population.side_share)
+    presence = factor(draw, draw.population.side_share)
     for section, kind in side_kinds("rca", "sides").items():
-        if generator.random() > kind.share * presence:
+        if draw.generator.random() > kind.share * presence:
             continue
-        origin = branching.free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
-        length = branching.truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        origin = branching.free_origin(draw, *kind.origin_mm, [plan.origin for plan in plans])
+        length = branching.truncated(draw, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
         # The main vessel's tip stays the farthest.
         length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
-        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
-        plans.append(_plan(section, origin, length, diameter, kind.courses))
-    if targets.dominance == "right" and (presence >= 1 or generator.random() < 0.3 + presence):
+        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(draw.generator.normal()))
+        plans.append(branching.SidePlan(section, origin, length, diameter, kind.courses))
+    if targets.dominance == "right" and (presence >= 1 or draw.generator.random() < 0.3 + presence):
         other = "16" if targets.ends_in == "4" else "4"
-        length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
-        diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
-        plans.append(_plan(other, crux, length, diameter, vessel_data("rca")["distal"][other]))
+        length = max((end_mm - crux * shape.STEP_MM) * float(draw.generator.uniform(0.6, 0.92)), 12.0)
+        diameter = 2 * float(radius[crux]) * float(draw.generator.uniform(0.68, 0.8))
+        plans.append(branching.SidePlan(other, crux, length, diameter, vessel_data("rca")["distal"][other]))
     return plans
-
-
-def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> branching.SidePlan:
-    return branching.SidePlan(
-        section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses
-    )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas.branching import NoShape, SidePlan, truncated
-from endopilot.atlas.population import Population, Spread
+from endopilot.atlas.population import Draw, Spread
 from endopilot.types import Centerline, VesselTree
 
 TIGHTEST = 0.97  # greatest curvature times radius of a main vessel: at 1 the lumen's inner wall shrinks to a point
@@ -38,26 +38,26 @@ class Fork:
     deflection_deg: float | None = None
 
 
-def drawn_from(generator: np.random.Generator, spread: Spread) -> float:
+def drawn_from(draw: Draw, spread: Spread) -> float:
     """Draw from a truncated log-normal distribution."""
     median, sd, low, high = spread
-    return float(np.exp(truncated(generator, np.log(median), sd, np.log(low), np.log(high))))
+    return float(np.exp(truncated(draw, np.log(median), sd, np.log(low), np.log(high))))
 
 
-def factor(generator: np.random.Generator, bounds: tuple[float, float]) -> float:
+def factor(draw: Draw, bounds: tuple[float, float]) -> float:
     """Draw a factor between two bounds; 1 without a draw where both are 1."""
-    return 1.0 if bounds == (1.0, 1.0) else float(generator.uniform(*bounds))
+    return 1.0 if bounds == (1.0, 1.0) else float(draw.generator.uniform(*bounds))
 
 
-def varied(generator: np.random.Generator, plans: Sequence[SidePlan], population: Population) -> list[SidePlan]:
+def varied(draw: Draw, plans: Sequence[SidePlan]) -> list[SidePlan]:
     """Return the plans with a patient's angles and calibres."""
     changed = []
     for plan in plans:
         angle = plan.angle_deg
-        if population.side_angle_deg is not None:
-            middle = drawn_from(generator, population.side_angle_deg)
+        if draw.population.side_angle_deg is not None:
+            middle = drawn_from(draw, draw.population.side_angle_deg)
             angle = (middle - 3.0, middle + 3.0)
-        calibre = factor(generator, population.side_calibre)
+        calibre = factor(draw, draw.population.side_calibre)
         changed.append(replace(plan, angle_deg=angle, diameter_mm=plan.diameter_mm * calibre))
     return changed
 
@@ -68,32 +68,30 @@ def forks_of(plans: Sequence[SidePlan], parent: int) -> list[Fork]:
 
 
 def bent(
-    generator: np.random.Generator,
+    draw: Draw,
     points: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
-    population: Population,
     *,
     forks: Sequence[Fork] = (),
     first: int = 0,
 ) -> Float[np.ndarray, "n 3"]:
     """Return a vessel with waves, sharp bends and deflections behind its point `first`, of the same length; the
     textbook's population draws none. Raises NoShape where no draw kept the lumen's wall from folding."""
-    if not population.bends_vessels:
+    if not draw.population.bends_vessels:
         return points
-    mean = population.bends_per_100_mm
-    rate = min(float(generator.exponential(mean)), _MOST_BENDS * mean) if mean else 0.0
+    mean = draw.population.bends_per_100_mm
+    rate = min(float(draw.generator.exponential(mean)), _MOST_BENDS * mean) if mean else 0.0
     for _ in range(_TRIES):
-        moved = shape.turned(points, _turns(generator, points, radius, population, forks, first, rate))
+        moved = shape.turned(points, _turns(draw, points, radius, forks, first, rate))
         if (shape.curvature(moved) * radius)[1:-1].max() < TIGHTEST:
             return moved
     raise NoShape
 
 
 def _turns(
-    generator: np.random.Generator,
+    draw: Draw,
     points: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
-    population: Population,
     forks: Sequence[Fork],
     first: int,
     rate: float,
@@ -104,44 +102,42 @@ def _turns(
     one = shape.parallel_normals(ahead)
     two = np.cross(ahead, one)
     along = shape.STEP_MM * (np.arange(len(steps)) + 0.5 - first)
-    angles = _waves(generator, along, population)
-    count = int(generator.poisson(rate * max(along[-1], 0.0) / 100.0))
+    angles = _waves(draw, along)
+    count = int(draw.generator.poisson(rate * max(along[-1], 0.0) / 100.0))
     for _ in range(count):
         begin = max(_QUIET_MM, _STRAIGHT_MM - shape.STEP_MM * first)
-        where = float(generator.uniform(begin, max(along[-1] - 6.0, begin + 1.0)))
+        where = float(draw.generator.uniform(begin, max(along[-1] - 6.0, begin + 1.0)))
         wide = float(np.interp(where, along, radius[1:]))
-        angle = np.deg2rad(float(generator.uniform(*population.bend_deg)))
-        tightness = float(np.exp(generator.uniform(*np.log(population.bend_tightness))))
+        angle = np.deg2rad(float(draw.generator.uniform(*draw.population.bend_deg)))
+        tightness = float(np.exp(draw.generator.uniform(*np.log(draw.population.bend_tightness))))
         # The angle runs as a·u·exp((1 − u²)/2): its slope, the curvature, is a·√e/w at the middle.
         width = np.sqrt(np.e) * angle * wide / tightness
         u = (along - where) / width
         profile = angle * u * np.exp(0.5 * (1 - u**2))
-        azimuth = float(generator.uniform(0, 2 * np.pi))
+        azimuth = float(draw.generator.uniform(0, 2 * np.pi))
         angles += profile[:, None] * np.array([np.cos(azimuth), np.sin(azimuth)])
     for fork in forks:
         angle = fork.deflection_deg
         if angle is None:
-            if population.deflection_deg is None:
+            if draw.population.deflection_deg is None:
                 continue
-            angle = drawn_from(generator, population.deflection_deg)
+            angle = drawn_from(draw, draw.population.deflection_deg)
         at = min(fork.index, len(steps) - 1)
         side = np.array([one[at] @ fork.side, two[at] @ fork.side])
-        azimuth = np.arctan2(-side[1], -side[0]) + np.deg2rad(_SCATTER_DEG * float(generator.normal()))
+        azimuth = np.arctan2(-side[1], -side[0]) + np.deg2rad(_SCATTER_DEG * float(draw.generator.normal()))
         profile = np.deg2rad(angle) * _step_and_decay(along - shape.STEP_MM * (fork.index - first), radius[at])
         angles += profile[:, None] * np.array([np.cos(azimuth), np.sin(azimuth)])
     angles[along < 0] = 0.0
     return angles[:, :1] * two - angles[:, 1:] * one
 
 
-def _waves(
-    generator: np.random.Generator, along: Float[np.ndarray, "n"], population: Population
-) -> Float[np.ndarray, "n 2"]:
-    low, high = population.waves_deg
-    amplitude = np.deg2rad(np.exp(generator.uniform(np.log(low), np.log(high))))
-    shortest, longest = population.waves_mm
-    wavelength = np.exp(generator.uniform(np.log(shortest), np.log(longest), 8))
-    phase = generator.uniform(0, 2 * np.pi, (8, 2))
-    weight = generator.normal(size=(8, 2)) * np.sqrt(wavelength / wavelength.max())[:, None]
+def _waves(draw: Draw, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+    low, high = draw.population.waves_deg
+    amplitude = np.deg2rad(np.exp(draw.generator.uniform(np.log(low), np.log(high))))
+    shortest, longest = draw.population.waves_mm
+    wavelength = np.exp(draw.generator.uniform(np.log(shortest), np.log(longest), 8))
+    phase = draw.generator.uniform(0, 2 * np.pi, (8, 2))
+    weight = draw.generator.normal(size=(8, 2)) * np.sqrt(wavelength / wavelength.max())[:, None]
     weight = weight / np.sqrt((weight**2).sum(axis=0) / 2)
     waves = np.sum(weight * np.sin(2 * np.pi * along[:, None, None] / wavelength[:, None] + phase), axis=1)
     return amplitude * waves * np.clip(along / _QUIET_MM, 0.0, 1.0)[:, None]
@@ -153,7 +149,7 @@ def _step_and_decay(along: Float[np.ndarray, "n"], wide: float) -> Float[np.ndar
 
 
 def opened_fork(
-    generator: np.random.Generator,
+    draw: Draw,
     trunk: Float[np.ndarray, "n 3"],
     other: Float[np.ndarray, "m 3"],
     fork: int,
@@ -168,8 +164,8 @@ def opened_fork(
     across = _unit(across - (across @ arriving) * arriving)
     wanted = []
     for spread, sign in zip(turns_deg, (1.0, -1.0), strict=True):
-        angle = np.deg2rad(drawn_from(generator, spread))
-        tilt = Rotation.from_rotvec(np.deg2rad(12.0 * float(generator.normal())) * arriving)
+        angle = np.deg2rad(drawn_from(draw, spread))
+        tilt = Rotation.from_rotvec(np.deg2rad(12.0 * float(draw.generator.normal())) * arriving)
         wanted.append(np.cos(angle) * arriving + sign * np.sin(angle) * tilt.apply(across))
     behind = shape.STEP_MM * (np.arange(len(trunk) - 1) + 0.5 - fork)
     beside = shape.STEP_MM * (np.arange(len(other) - 1) + 0.5)
@@ -196,30 +192,26 @@ def _turned_to(
     return moved
 
 
-def ectasia(
-    generator: np.random.Generator, along: Float[np.ndarray, "n"], population: Population
-) -> tuple[list[dict[str, float]], Float[np.ndarray, "n"]]:
+def ectasia(draw: Draw, along: Float[np.ndarray, "n"]) -> tuple[list[dict[str, float]], Float[np.ndarray, "n"]]:
     """Return a widening by 40 to 100 % of the diameter over 10 to 30 mm where the patient has one, and its factor."""
-    if population.ectasia_share == 0 or generator.random() > population.ectasia_share:
+    if draw.population.ectasia_share == 0 or draw.generator.random() > draw.population.ectasia_share:
         return [], np.ones(len(along))
-    place, extent = along[0] + generator.uniform(0.15, 0.7) * (along[-1] - along[0]), generator.uniform(10.0, 30.0)
-    degree = generator.uniform(0.4, 1.0)
+    place = along[0] + draw.generator.uniform(0.15, 0.7) * (along[-1] - along[0])
+    extent, degree = draw.generator.uniform(10.0, 30.0), draw.generator.uniform(0.4, 1.0)
     drawn = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_increase": float(degree)}
     return [drawn], 1 + degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
 
 
-def flattened(
-    generator: np.random.Generator, tree: VesselTree, population: Population
-) -> list[tuple[Centerline, Centerline]]:
+def flattened(draw: Draw, tree: VesselTree) -> list[tuple[Centerline, Centerline]]:
     """Return two lines of spheres beside each branch, which make its section longer than wide; none for round ones.
     They lie δ to either side, with radius √(r² + δ²): the own spheres stay inscribed. The direction turns along the
     vessel."""
-    if population.flattening[1] == 0:
+    if draw.population.flattening[1] == 0:
         return []
-    mean = float(generator.uniform(*population.flattening))
+    mean = float(draw.generator.uniform(*draw.population.flattening))
     longest = max(float(branch.centerline.abscissa[-1]) for branch in tree.branches)
-    wavelength, phase = generator.uniform(20.0, 70.0, 3), generator.uniform(0, 2 * np.pi, 3)
-    start, turns = float(generator.uniform(0, np.pi)), float(generator.normal(0.0, 1.5))
+    wavelength, phase = draw.generator.uniform(20.0, 70.0, 3), draw.generator.uniform(0, 2 * np.pi, 3)
+    start, turns = float(draw.generator.uniform(0, np.pi)), float(draw.generator.normal(0.0, 1.5))
     beside = []
     for line in (branch.centerline for branch in tree.branches):
         waves = np.sin(2 * np.pi * line.abscissa[:, None] / wavelength + phase).sum(axis=1)
@@ -242,12 +234,12 @@ def flattened(
 
 
 def catheter_direction(
-    generator: np.random.Generator, tree: VesselTree, population: Population, radius_mm: float, length_mm: float
+    draw: Draw, tree: VesselTree, radius_mm: float, length_mm: float
 ) -> tuple[Float[np.ndarray, "3"], dict[str, Any]]:
     """Return the axis of a guiding catheter at the ostium, and its draws: at the drawn angle with the vessel 10 mm on,
     little turned away from its first direction, and clear of other lumens; else along the first direction."""
     first = shape.tangents(tree.branches[0].centerline.points)[0]
-    if population.catheter_deg is None:
+    if draw.population.catheter_deg is None:
         return first, {}
     path = tree.longest_path()
     at = min(int(np.searchsorted(path.abscissa, 10.0)), len(path.points) - 2)
@@ -261,8 +253,8 @@ def catheter_direction(
     for attempt in range(5 * _TRIES):
         # An angle is given up only after a round of tries: else flat ones would be kept more often than steep ones.
         if attempt % _TRIES == 0:
-            angle = np.deg2rad(drawn_from(generator, population.catheter_deg))
-        scatter = np.deg2rad((25.0 + 3.0 * attempt) * float(generator.normal()))
+            angle = np.deg2rad(drawn_from(draw, draw.population.catheter_deg))
+        scatter = np.deg2rad((25.0 + 3.0 * attempt) * float(draw.generator.normal()))
         tilted = Rotation.from_rotvec(scatter * there).apply(across)
         direction = np.cos(angle) * there + np.sin(angle) * tilted
         line = path.points[0] - tube[:, None] * direction

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from endopilot.imaging.grid import connected_components, dilated, distance_to_outside
+from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.imaging.voxels import dilated
 from endopilot.types import Volume
 
 _SMOOTHING_MM = 0.3  # width of the Gaussian against noise, mm: about the scanner's own blur
@@ -48,7 +49,9 @@ def lumen_at_half_height(
     level = surroundings + share * (lumen_hu - surroundings)
     calcium = band & (hu >= CALCIUM * lumen_hu)
     inside = band & (hu > level) & ~calcium
-    _drop_rims(inside, _large_parts(calcium), distance, spacing)
+    label = connected_components(calcium)
+    large = np.bincount(label.ravel()) >= _FEWEST_VOXELS
+    _drop_rims(inside, calcium & large[label], distance, spacing)
     return inside
 
 
@@ -64,15 +67,6 @@ def _drop_rims(inside: np.ndarray, calcium: np.ndarray, distance: np.ndarray, sp
     voxels, plaque = voxels[beside], plaque[nearest[beside]]
     rim = distance[tuple(voxels.T)] >= distance[tuple(plaque.T)]
     inside[tuple(voxels[rim].T)] = False
-
-
-def _large_parts(mask: np.ndarray) -> Bool[np.ndarray, "nz ny nx"]:
-    if not mask.any():
-        return mask
-    label = connected_components(mask)
-    kept = np.bincount(label.ravel()) >= _FEWEST_VOXELS
-    kept[0] = False
-    return kept[label]
 
 
 def _distance_to_paths(

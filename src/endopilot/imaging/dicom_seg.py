@@ -102,7 +102,9 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
     axes, normal = plane(orientation, spacing, path=path)
     slots = _slots(positions @ normal, step, path)
     place = slice_grid(positions, slots, axes, spacing, pixels.shape[1:], path=path)
-    present = _present(pixels, half, numbers, kind)
+    present = {number for number, pixel in zip(numbers, pixels, strict=True) if pixel.max() >= half}
+    if kind == "LABELMAP":
+        present = {int(number) for number in np.unique(pixels) if number > 0}
     if not present:
         raise InputError(f"{path}: the mask is empty; segment the vessel again or give another file")
     numbered = [(number, Segment(names.get(number, ""), 0, number)) for number in sorted(present)]
@@ -163,9 +165,3 @@ def _slots(heights: Float[np.ndarray, "frames"], step_mm: float, path: Path) -> 
             "export it as .nii.gz"
         )
     return np.concatenate([[0], np.cumsum(steps)])[place_of]
-
-
-def _present(pixels: np.ndarray, half: int, numbers: list[int], kind: str) -> set[int]:
-    if kind == "LABELMAP":
-        return {int(number) for number in np.unique(pixels) if number > 0}
-    return {number for number, pixel in zip(numbers, pixels, strict=True) if pixel.max() >= half}

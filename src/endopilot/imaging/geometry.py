@@ -21,16 +21,11 @@ AXES_TOLERANCE = 1e-2  # cosine between axes, and error of a unit vector's lengt
 _PLACE_TOLERANCE = 0.05  # a slice may lie off its place by this share of the step: positions have few digits
 _ROUNDING = 1e-5  # what single precision and six decimals leave, some micrometres: it is not noted
 
-MM_PER_UNIT = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
-    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 1e-3),
-    **dict.fromkeys(("in", "inch", "inches"), 25.4),
-}
-"""Millimetres in each unit of length that a header may name, in lower case."""
-_CONVERTED_MM = (1e-3, 20.0)  # voxel sizes that a unit other than mm may lead to, mm: else the unit is wrong
+
+def require(good: object, path: Path, said: str) -> None:
+    """Raise InputError, which names the file and what is wrong with it, unless a check of its header is passed."""
+    if not good:
+        raise InputError(f"{path}: {said}")
 
 
 @dataclass(frozen=True)
@@ -69,22 +64,18 @@ def geometry(
     nearest rotation about its centre. Raises InputError, which names the header's `fields`, for what is no such
     geometry."""
     for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
-        if not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} holds {_text(values)}, which is not finite; export it again")
-    if spacing_mm.min() <= 0:
-        raise InputError(f"{path}: {fields.spacing} gives voxels of {lengths_text(spacing_mm)} mm; export it again")
+        shown = " ".join(f"{value:g}" for value in np.ravel(values))
+        require(np.isfinite(values).all(), path, f"{name} holds {shown}, which is not finite; export it again")
+    small = f"{fields.spacing} gives voxels of {lengths_text(spacing_mm)} mm; export it again"
+    require(spacing_mm.min() > 0, path, small)
     lengths = np.linalg.norm(direction, axis=0)
-    if np.abs(lengths - 1.0).max() >= AXES_TOLERANCE:
-        raise InputError(
-            f"{path}: {fields.direction} holds axes of length {lengths_text(lengths)}, which must be 1; export it again"
-        )
+    long = f"{fields.direction} holds axes of length {lengths_text(lengths)}, which must be 1; export it again"
+    require(np.abs(lengths - 1.0).max() < AXES_TOLERANCE, path, long)
     axes = direction / lengths
     skew = float(np.abs(axes.T @ axes - np.eye(3)).max())
-    if skew >= AXES_TOLERANCE:
-        raise InputError(
-            f"{path}: {fields.direction}: its axes are not at right angles (off by {np.degrees(np.arcsin(skew)):.2g}°: "
-            "a sheared image or a gantry tilt); resample it to straight slices"
-        )
+    off = f"off by {np.degrees(np.arcsin(min(skew, 1.0))):.2g}°: a sheared image or a gantry tilt"
+    sheared = f"{fields.direction}: its axes are not at right angles ({off}); resample it to straight slices"
+    require(skew < AXES_TOLERANCE, path, sheared)
     left, _, right = np.linalg.svd(axes)
     straight = left @ right
     # 0 - 0 and not -0: the axes of an upright volume stay the plain numbers that they are.
@@ -147,12 +138,12 @@ def slice_grid(
     travel = (last - first) / slots.max()
     step = float(np.linalg.norm(travel))
     off = np.linalg.norm(positions - first - slots[:, None] * travel, axis=1)
-    if off.max() > _PLACE_TOLERANCE * step:
-        worst = int(off.argmax())
-        raise InputError(
-            f"{path}: ImagePositionPatient are not evenly spaced: slice {slots[worst] + 1} lies {off[worst]:.2f} mm "
-            f"from where even steps of {step:.2f} mm put it; export the series again, or resample it to even steps"
-        )
+    worst = int(off.argmax())
+    uneven = f"slice {slots[worst] + 1} lies {off[worst]:.2f} mm from where even steps of {step:.2f} mm put it"
+    mend = "export the series again, or resample it to even steps"
+    require(
+        off[worst] <= _PLACE_TOLERANCE * step, path, f"ImagePositionPatient are not evenly spaced: {uneven}; {mend}"
+    )
     return geometry(
         np.column_stack([axes, travel / step]),
         np.array([*spacing_mm[::-1], step]),
@@ -161,26 +152,6 @@ def slice_grid(
         path=path,
         fields=Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
     )
-
-
-def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
-    """Return the factor from a unit of length to mm, and its note; InputError if voxels are not of 1 µm to 20 mm."""
-    factor = MM_PER_UNIT.get(unit.strip().lower())
-    if factor is None:
-        raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")
-    if factor == 1.0:
-        return 1.0, ()
-    least, most = _CONVERTED_MM
-    lengths = np.abs(sizes) * factor
-    if not (lengths >= least).all() or not (lengths <= most).all():
-        raise InputError(
-            f"{path}: {field} says {unit}, but voxels would then have {lengths_text(lengths)} mm; export it in mm"
-        )
-    return factor, (f"{path.name}: {field} says {unit}; lengths were converted to mm",)
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(f"{value:g}" for value in np.ravel(values))
 
 
 def lengths_text(lengths: np.ndarray) -> str:

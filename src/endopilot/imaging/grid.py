@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,32 +86,6 @@ def distance_to_outside(
     outside.SetSpacing([float(step) for step in np.broadcast_to(spacing_mm, 3)[::-1]])
     signed = sitk.SignedMaurerDistanceMap(outside, insideIsPositive=False, squaredDistance=False, useImageSpacing=True)
     return np.maximum(sitk.GetArrayFromImage(signed), np.float32(0))
-
-
-def distance_and_nearest(
-    mask: Bool[np.ndarray, "nz ny nx"], spacing_mm: float | tuple[float, float, float]
-) -> tuple[Float[np.ndarray, "nz ny nx"], tuple[np.ndarray, ...]]:
-    """Return `distance_to_outside`, and the indices (k, j, i) of that nearest voxel outside."""
-    distance, nearest = ndimage.distance_transform_edt(mask, sampling=spacing_mm, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
-    return distance.astype(np.float32), tuple(nearest)
-
-
-def dilated(mask: Bool[np.ndarray, "nz ny nx"], reach: int | Sequence[int]) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the voxels whose box of `reach` voxels to either side (along k, j, i, or one for all) holds any of a mask:
-    a box grown to one size is shifted by that size, in a fourth of the time of SciPy's maximum filter."""
-    grown = mask
-    for axis, least in enumerate(np.broadcast_to(reach, 3).tolist()):
-        held, done = np.moveaxis(grown, axis, 0), 0
-        while done < least:
-            step = min(2 * done + 1, least - done)
-            wider = held.copy(order="K")
-            wider[step:] |= held[:-step]
-            wider[:-step] |= held[step:]
-            wider[:step] |= held[0]
-            wider[-step:] |= held[-1]
-            held, done = wider, done + step
-        grown = np.moveaxis(held, 0, axis)
-    return grown
 
 
 def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = False) -> Int[np.ndarray, "nz ny nx"]:

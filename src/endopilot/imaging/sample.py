@@ -28,14 +28,6 @@ _FILES = {
         f"{_REPORT}/test_result/models/aorta.nii.gz",
         "7fa1b813c63abcbe455b62a510c5e7a00fe0998f30541d5a8af46b20a88dd7f7",
     ),
-    "seg_aorta_true_lumen.nii.gz": (
-        f"{_REPORT}/test_result/models/aorta_true_lumen.nii.gz",
-        "37d3694cb1a780d5e345df035d5886e70fbc9ed25cb283bf6a5d1ba454a019f5",
-    ),
-    "seg_aorta_false_lumen.nii.gz": (
-        f"{_REPORT}/test_result/models/aorta_false_lumen.nii.gz",
-        "dd4126c20b495b840399accfbe147c67f9827b58462ff117e803f378d00c1d38",
-    ),
 }
 """Name in the cache: place in the archive, and SHA-256. The first is the CT."""
 

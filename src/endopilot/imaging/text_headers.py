@@ -14,14 +14,19 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, parted
+from endopilot.imaging.geometry import Fields, Geometry, geometry, parted, require
 from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import read_voxels_beside
 
 _LONGEST_HEADER = 1 << 20
-_TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
-_LETTERS = {word[0]: word for word in _TO_LPS}
-_WORLD_AXES = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
+_NOT_SUCH = "its content does not match its suffix, or its header is damaged; export it again"
+_NO_END = "truncated or damaged (its header does not end); copy or export it again"
+_SPACES = {
+    **dict.fromkeys(("right-anterior-superior", "ras"), (-1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (1.0, 1.0, 1.0)),
+}
+"""The patient's axes that NRRD defines, and the signs that turn them to LPS."""
 
 _NRRD_TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -75,12 +80,12 @@ def read_nrrd(path: Path) -> ImageFile:
         segments = _segments(keys, path)
         extra = [axis for axis in range(len(sizes)) if axis not in domain]
         count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
-        if count > 1 and not segments:
-            shape = "×".join(map(str, sizes))
-            if len(extra) > 1 or _kinds(fields, extra)[:1] in (["list"], ["time"]):
-                raise InputError(f"{path}: {len(sizes)}-D ({shape}); give one 3-D volume, such as one cardiac phase")
-            raise InputError(f"{path}: {count} values in every voxel (colour or vectors); give a grey-level volume")
-        values, files = _values(fields, sizes, stream, path)
+        kinds = dict(enumerate(fields.get("kinds", "").lower().split()))
+        lasting = len(extra) > 1 or any(kinds.get(axis) in ("list", "time") for axis in extra)
+        what = f"{len(sizes)}-D ({'×'.join(map(str, sizes))}); give one 3-D volume, such as one cardiac phase"
+        what = what if lasting else f"{count} values in every voxel (colour or vectors); give a grey-level volume"
+        require(count <= 1 or segments, path, what)
+        values, files = _values(fields, sizes, stream.read(), path)
     # The first axis of the file is the fastest, and so the last of the array.
     order = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
     layers = values.transpose(order).reshape(count, *(sizes[axis] for axis in reversed(domain)))
@@ -89,8 +94,7 @@ def read_nrrd(path: Path) -> ImageFile:
 
 def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[str, str]]:
     """Return fields and keys of a header, and leave the stream at the byte after its empty line."""
-    if not re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)):
-        raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
+    require(re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)), path, _NOT_SUCH)
     fields: dict[str, str] = {}
     keys: dict[str, str] = {}
     while line := stream.readline(_LONGEST_HEADER):
@@ -106,13 +110,12 @@ def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], di
             continue
         name = field.strip().lower()
         name = _NRRD_SYNONYMS.get(name, name)
-        if not colon or not name or name in fields:
-            raise InputError(f"{path}: its header is damaged ({text[:60]!r} is no field of its own); export it again")
+        damaged = f"its header is damaged ({text[:60]!r} is no field of its own); export it again"
+        require(colon and name and name not in fields, path, damaged)
         fields[name] = description.strip()
         if name == "data file" and fields[name].split()[:1] == ["LIST"]:
             return fields, keys
-    if "data file" not in fields:
-        raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
+    require("data file" in fields, path, _NO_END)
     return fields, keys
 
 
@@ -123,76 +126,60 @@ def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[Float[np.
         dimension = int(fields.get("dimension", ""))
     except ValueError:
         sizes, dimension = [], 0
-    if not sizes or dimension != len(sizes) or min(sizes) < 1:
-        raise InputError(f"{path}: its dimension and sizes describe no image; export it again")
-    if "space" not in fields:
-        raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
+    whole = dimension == len(sizes) and min(sizes, default=0) >= 1
+    require(whole, path, "its dimension and sizes describe no image; export it again")
+    nowhere = "has no orientation (no space in its header); export it with its space directions"
+    require("space" in fields, path, nowhere)
     text = fields.get("space directions", "")
     words = re.findall(r"none|\([^()]*\)", text)
     vectors = [None if word == "none" else _vector(word, "space directions", path) for word in words]
-    if len(words) != len(sizes) or re.sub(r"none|\([^()]*\)", "", text).strip():
-        raise InputError(f"{path}: space directions {text[:80]!r} are not one vector an axis; export it again")
-    if (count := len(words) - sum(vector is None for vector in vectors)) != 3:
-        shape = "×".join(map(str, sizes))
-        raise InputError(f"{path}: {shape} voxels with {count} axes in space are no volume; give a 3-D volume")
+    one_each = len(words) == len(sizes) and not re.sub(r"none|\([^()]*\)", "", text).strip()
+    require(one_each, path, f"space directions {text[:80]!r} are not one vector an axis; export it again")
+    count = sum(vector is not None for vector in vectors)
+    flat = f"{'×'.join(map(str, sizes))} voxels with {count} axes in space are no volume; give a 3-D volume"
+    require(count == 3, path, flat)
     return sizes, vectors
-
-
-def _kinds(fields: dict[str, str], axes: list[int]) -> list[str]:
-    kinds = fields.get("kinds", "").split()
-    return [kinds[axis].lower() for axis in axes if axis < len(kinds)]
 
 
 def _nrrd_geometry(
     fields: dict[str, str], vectors: list[Float[np.ndarray, "3"] | None], size: tuple[int, ...], path: Path
 ) -> Geometry:
-    to_lps = _to_lps(fields["space"], path)
-    if "space origin" not in fields:
-        raise InputError(f"{path}: has no place (no space origin in its header); export it with its space origin")
+    space = fields["space"]
+    where = f"space {space[:40]!r} does not say where the patient's left, back and head are"
+    require(space.lower() in _SPACES, path, f"{where}; export it in left-posterior-superior")
+    to_lps = np.array(_SPACES[space.lower()])
+    nowhere = "has no place (no space origin in its header); export it with its space origin"
+    require("space origin" in fields, path, nowhere)
     origin = _vector(fields["space origin"], "space origin", path)
     steps = np.array([vector for vector in vectors if vector is not None]).T
-    units = set(re.findall(r'"([^"]*)"', fields.get("space units", ""))) - {""} or {"mm"}
-    if len(units) > 1 or ("space units" in fields and '"' not in fields["space units"]):
-        raise InputError(f"{path}: space units {fields['space units'][:60]!r} are not one unit; export it in mm")
+    units = fields.get("space units", "").lower()
+    in_mm = set(re.findall(r'"([^"]*)"', units)) <= {"", "mm"} and ("space units" not in fields or '"' in units)
+    require(in_mm, path, f"space units {units[:60]!r} are not mm; export it in mm")
     lengths = np.linalg.norm(steps, axis=0)
-    factor, notes = converted(units.pop(), lengths, path=path, field="space units")
     along = zip(fields.get("spacings", "").split(), vectors, strict=False)
     given = [word for word, vector in along if vector is not None and word.lower() != "nan"]
-    if given and not np.allclose(_numbers(given, 3, "spacings", path), lengths, rtol=1e-2):
-        raise InputError(f"{path}: spacings {' '.join(given)} contradict space directions; export it again")
-    steps, origin = to_lps[:, None] * steps * factor, to_lps * origin * factor
-    place = geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
-    return replace(place, notes=(*notes, *place.notes))
-
-
-def _to_lps(space: str, path: Path) -> np.ndarray:
-    words = space.strip().lower().split("-")
-    if len(words) == 1 and len(words[0]) == 3:
-        words = [_LETTERS.get(letter, "") for letter in words[0]]
-    if len(words) != 3 or any(word not in pair for word, pair in zip(words, _WORLD_AXES, strict=True)):
-        raise InputError(
-            f"{path}: space {space[:40]!r} does not say where the patient's left, back and head are; export it in "
-            "left-posterior-superior"
-        )
-    return np.array([_TO_LPS[word] for word in words])
+    same = not given or np.allclose(_numbers(given, 3, "spacings", path), lengths, rtol=1e-2)
+    require(same, path, f"spacings {' '.join(given)} contradict space directions; export it again")
+    steps, origin = to_lps[:, None] * steps, to_lps * origin
+    return geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
 
 
 def _values(
-    fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
+    fields: dict[str, str], sizes: list[int], rest: bytes, path: Path
 ) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    kind, packed = fields.get("type", "").lower(), _PACKED.get(fields.get("encoding", "").lower())
-    if kind not in _NRRD_TYPES:
-        raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")
-    if packed is None:
-        raise InputError(f"{path}: encoding {fields.get('encoding', '')!r} is not read; export it as raw or gzip")
+    kind, encoding, endian = (fields.get(name, "") for name in ("type", "encoding", "endian"))
+    dtype, packed = _NRRD_TYPES.get(kind.lower(), ""), _PACKED.get(encoding.lower())
+    require(dtype, path, f"type {kind.lower()!r} holds no grey levels; export it as short or float")
+    require(packed is not None, path, f"encoding {encoding!r} is not read; export it as raw or gzip")
     for name in ("line skip", "byte skip"):
-        if fields.get(name, "0") != "0":
-            raise InputError(f"{path}: {name} {fields[name][:20]!r} is not read; export it again")
-    endian = fields.get("endian", "").lower()
-    if endian not in ("little", "big") and _NRRD_TYPES[kind][1] != "1":
-        raise InputError(f"{path}: endian {endian!r} is neither little nor big; export it again")
-    dtype = np.dtype((">" if endian == "big" else "<") + _NRRD_TYPES[kind])
-    return read_voxels_beside(fields.get("data file"), stream, dtype, sizes[::-1], packed=packed, header=path)
+        skipped = fields.get(name, "0")
+        require(skipped == "0", path, f"{name} {skipped[:20]!r} is not read; export it again")
+    odd = f"endian {endian.lower()!r} is neither little nor big; export it again"
+    require(endian.lower() in ("little", "big") or dtype[1] == "1", path, odd)
+    order = ">" if endian.lower() == "big" else "<"
+    return read_voxels_beside(
+        fields.get("data file"), rest, np.dtype(order + dtype), sizes[::-1], packed=bool(packed), header=path
+    )
 
 
 def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
@@ -201,8 +188,8 @@ def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
     segments = []
     for place, number in enumerate(numbers):
         value, layer = (keys.get(f"Segment{number}_{part}", "") for part in ("LabelValue", "Layer"))
-        if not re.fullmatch(r"\d{0,9}", value) or not re.fullmatch(r"\d{0,9}", layer):
-            raise InputError(f"{path}: Segment{number} has no whole numbers as LabelValue and Layer; export it again")
+        whole = re.fullmatch(r"\d{0,9} \d{0,9}", f"{value} {layer}")
+        require(whole, path, f"Segment{number} has no whole numbers as LabelValue and Layer; export it again")
         name = keys.get(f"Segment{number}_Name") or keys.get(f"Segment{number}_ID", "")
         plain = not value and not layer
         segments.append(Segment(name, place if plain else int(layer or 0), int(value or 1)))
@@ -218,7 +205,7 @@ def read_metaimage(path: Path) -> ImageFile:
         dtype, packed = _meta_encoding(fields, path)
         source = fields["ElementDataFile"]
         beside = None if source.upper() == "LOCAL" else source
-        voxels, files = read_voxels_beside(beside, stream, dtype, size[::-1], packed=packed, header=path)
+        voxels, files = read_voxels_beside(beside, stream.read(), dtype, size[::-1], packed=packed, header=path)
     return ImageFile(place.volume(voxels, files), voxels[None])
 
 
@@ -231,16 +218,13 @@ def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
         name = _META_SYNONYMS.get(name.strip(), name.strip())
         if line and not line.strip():
             continue
-        if not fields and not (sign and name.isidentifier()):
-            raise InputError(
-                f"{path}: its content does not match its suffix, or its header is damaged; export it again"
-            )
-        if not sign or not name or name in fields:
-            raise InputError(f"{path}: its header is damaged ({name[:40]!r} is no field of its own); export it again")
+        require(fields or (sign and name.isidentifier()), path, _NOT_SUCH)
+        damaged = f"its header is damaged ({name[:40]!r} is no field of its own); export it again"
+        require(sign and name and name not in fields, path, damaged)
         fields[name] = value.strip()
         if name == "ElementDataFile":
             return fields
-    raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
+    raise InputError(f"{path}: {_NO_END}")
 
 
 def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
@@ -249,57 +233,60 @@ def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
         count, channels = int(fields.get("NDims", "")), int(fields.get("ElementNumberOfChannels", "1"))
     except ValueError:
         extents, count, channels = [], 0, 1
-    if not extents or count != len(extents) or min(extents) < 1:
-        raise InputError(f"{path}: its NDims and DimSize describe no image; export it again")
-    if channels != 1:
-        raise InputError(f"{path}: {channels} values in every voxel (colour or vectors); give a grey-level volume")
+    whole = count == len(extents) and min(extents, default=0) >= 1
+    require(whole, path, "its NDims and DimSize describe no image; export it again")
+    colour = f"{channels} values in every voxel (colour or vectors); give a grey-level volume"
+    require(channels == 1, path, colour)
     shape = "×".join(map(str, extents))
-    if any(extent > 1 for extent in extents[3:]):
-        raise InputError(f"{path}: {count}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
-    if count < 3:
-        raise InputError(f"{path}: {shape} voxels are no volume; give a 3-D volume")
+    several = f"{count}-D ({shape}); give a single 3-D volume, such as one cardiac phase"
+    require(max(extents[3:], default=1) == 1, path, several)
+    require(count >= 3, path, f"{shape} voxels are no volume; give a 3-D volume")
     return extents[0], extents[1], extents[2]
 
 
 def _meta_encoding(fields: dict[str, str], path: Path) -> tuple[np.dtype, bool]:
     """Return the voxels' type, and whether they are packed."""
     kind = fields.get("ElementType", "")
-    if kind not in _META_TYPES:
-        raise InputError(f"{path}: ElementType {kind[:40]!r} holds no grey levels; export it as MET_SHORT or MET_FLOAT")
-    if fields.get("HeaderSize", "0") != "0" or not _truth(fields, "BinaryData", True, path):
-        raise InputError(f"{path}: HeaderSize, or text in place of BinaryData, is not read; export it again")
+    none = f"ElementType {kind[:40]!r} holds no grey levels; export it as MET_SHORT or MET_FLOAT"
+    require(kind in _META_TYPES, path, none)
+    plain = fields.get("HeaderSize", "0") == "0" and _truth(fields, "BinaryData", True, path)
+    require(plain, path, "HeaderSize, or text in place of BinaryData, is not read; export it again")
     big = _truth(fields, "BinaryDataByteOrderMSB", False, path)
     return np.dtype((">" if big else "<") + _META_TYPES[kind]), _truth(fields, "CompressedData", False, path)
 
 
 def _truth(fields: dict[str, str], name: str, default: bool, path: Path) -> bool:
     text = fields.get(name, str(default))
-    if text[:1].upper() not in ("T", "F", "1", "0"):
-        raise InputError(f"{path}: {name} {text[:20]!r} is neither True nor False; export it again")
+    require(
+        re.match("[TF10]", text, re.IGNORECASE),
+        path,
+        f"{name} {text[:20]!r} is neither True nor False; export it again",
+    )
     return text[:1].upper() in ("T", "1")
 
 
 def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Path) -> Geometry:
     count = int(fields["NDims"])
-    if "ElementSpacing" not in fields:
-        raise InputError(f"{path}: has no ElementSpacing, so that its voxels have no size; export it again")
-    spacing = _named_numbers(fields, "ElementSpacing", count, path)[:3]
-    factor, notes = converted(fields.get("DistanceUnits", "mm"), spacing, path=path, field="DistanceUnits")
-    origin = np.zeros(3)
+    sizeless = "has no ElementSpacing, so that its voxels have no size; export it again"
+    require("ElementSpacing" in fields, path, sizeless)
+    spacing = _numbers(fields["ElementSpacing"].split(), count, "ElementSpacing", path)[:3]
+    unit, notes, origin = fields.get("DistanceUnits", "mm"), tuple[str, ...](), np.zeros(3)
+    require(unit.lower() == "mm", path, f"DistanceUnits {unit[:20]!r} is not mm; export it in mm")
     if "Offset" in fields:
-        origin = _named_numbers(fields, "Offset", count, path)[:3]
+        origin = _numbers(fields["Offset"].split(), count, "Offset", path)[:3]
     else:
         notes += (f"{path.name}: has no Offset; its first voxel was put at 0 0 0",)
     words = fields.get("AnatomicalOrientation", "RAI").strip().upper()
     if "TransformMatrix" in fields:
         # Its rows are the directions of i, j and k.
-        direction = _named_numbers(fields, "TransformMatrix", count * count, path).reshape(count, count)[:3, :3].T
-    elif words in ("RAI", "???"):
+        rows = _numbers(fields["TransformMatrix"].split(), count * count, "TransformMatrix", path)
+        direction = rows.reshape(count, count)[:3, :3].T
+    else:
+        turned = f"AnatomicalOrientation {words[:20]} without a TransformMatrix; export it again"
+        require(words in ("RAI", "???"), path, turned)
         direction = np.eye(3)
         notes += (f"{path.name}: has no TransformMatrix; its axes were taken as left, posterior and superior",)
-    else:
-        raise InputError(f"{path}: AnatomicalOrientation {words[:20]} without a TransformMatrix; export it again")
-    place = geometry(direction, spacing * factor, origin * factor, size, path=path, fields=_META_FIELDS)
+    place = geometry(direction, spacing, origin, size, path=path, fields=_META_FIELDS)
     return replace(place, notes=(*notes, *place.notes))
 
 
@@ -308,13 +295,9 @@ def _numbers(words: Sequence[str], count: int, field: str, path: Path) -> Float[
         numbers = np.array(words, dtype=float)
     except ValueError:
         numbers = np.array([])
-    if len(numbers) != count:
-        raise InputError(f"{path}: {field} {' '.join(words)[:80]!r} is not {count} numbers; export it again")
+    said = f"{field} {' '.join(words)[:80]!r} is not {count} numbers; export it again"
+    require(len(numbers) == count, path, said)
     return numbers
-
-
-def _named_numbers(fields: dict[str, str], name: str, count: int, path: Path) -> Float[np.ndarray, "_"]:
-    return _numbers(fields[name].split(), count, name, path)
 
 
 def _vector(text: str, field: str, path: Path) -> Float[np.ndarray, "3"]:

@@ -202,7 +202,7 @@ def _plaques(grid: Grid, anatomy: Anatomy, generator: np.random.Generator, mean_
     paths = chest.main_paths(anatomy.tree)
     plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
-        line = paths[-1] if stenosis.get("vessel") == "LCx" else paths[0]
+        line = paths[0]
         half = 0.6 * stenosis["length_mm"]
         ends = stenosis["abscissa_mm"] + np.array([-half, half])
         wall = float(np.interp(ends, line.abscissa, line.radius).max()) + 0.4

@@ -25,8 +25,7 @@ from endopilot.vessels.coronary_ostia import (
 from endopilot.vessels.ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.sources import check_unit
-from endopilot.vessels.surface import Surface, filled_box, surface_from_mask
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import Surface, distance_map_from_surface, filled_box, surface_from_mask
 
 CERTAIN = 0.8  # an ostium less probable than this is asked for
 PRESENT = 0.5  # the other artery is in the lumen if it begins in another piece with at least this probability
@@ -102,7 +101,8 @@ def coronary_inlet(
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
     runner_up = ranking.candidates[1] if len(ranking.candidates) > 1 else None
     mirrored = not paired and counterpart.axes[1] > _AS_WELL * counterpart.absent
-    notes = (_rival_axes(counterpart.axes[0], side),) if mirrored else ()
+    rival = f"{_exchanged(counterpart.axes[0])}, this would be a {_NAMES['lca' if side == 'rca' else 'rca']}"
+    notes = (f"{rival}: check the axes of the file",) if mirrored else ()
     return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None, notes)
 
 
@@ -137,11 +137,6 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
         f"one, such as --ostium-mm {first}"
         + (f"; or, {_in_other_axes(axes, coordinates)}" if turned > _AS_WELL * best.probability else "")
     )
-
-
-def _rival_axes(axes: str, side: Side) -> str:
-    other: Side = "lca" if side == "rca" else "rca"
-    return f"{_exchanged(axes)}, this would be a {_NAMES[other]}: check the axes of the file"
 
 
 def _exchanged(axes: str) -> str:

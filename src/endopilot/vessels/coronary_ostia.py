@@ -181,9 +181,16 @@ def _merged(
 
 def end_score(end: OpenEnd, side: Side, flip: Float[np.ndarray, "3"] | float = 1.0) -> float:
     """Return the log-likelihood, up to a constant, that an artery begins at an end; `flip` turns its axes to LPS."""
+    deviations = {
+        "calibre": (min(end.calibre, CALIBRE) - CALIBRE) / CALIBRE_SD,
+        "taper": (min(end.taper, TAPER) - TAPER) / TAPER_SD,
+        "widening": end.widening / WIDENING_SD,
+        "opening": max(end.opening_deg - OPENING_DEG, 0.0) / OPENING_SD_DEG,
+    }
+    shape = sum(WEIGHT[name] * float(_log_t(deviation**2)) for name, deviation in deviations.items())
     heading = WEIGHT["heading"] * _log_t((_angle_deg(flip * end.heading, HEADING[side]) / HEADING_SD_DEG) ** 2)
     course = WEIGHT["course"] * _log_t((_angle_deg(flip * end.course, COURSE[side]) / COURSE_SD_DEG) ** 2)
-    return shape_score(end) + float(heading + course)
+    return shape + float(heading + course)
 
 
 def course_off_deg(tree: VesselTree) -> dict[str, float]:
@@ -192,17 +199,6 @@ def course_off_deg(tree: VesselTree) -> dict[str, float]:
     course = np.concatenate(lines).mean(axis=0) - lines[0][0]
     course /= np.linalg.norm(course)
     return {side: float(_angle_deg(course, usual)) for side, usual in COURSE.items()}
-
-
-def shape_score(end: OpenEnd) -> float:
-    """Return the logarithmic likelihood, up to a constant, that any arterial tree begins at an end."""
-    deviations = {
-        "calibre": (min(end.calibre, CALIBRE) - CALIBRE) / CALIBRE_SD,
-        "taper": (min(end.taper, TAPER) - TAPER) / TAPER_SD,
-        "widening": end.widening / WIDENING_SD,
-        "opening": max(end.opening_deg - OPENING_DEG, 0.0) / OPENING_SD_DEG,
-    }
-    return sum(WEIGHT[name] * float(_log_t(deviation**2)) for name, deviation in deviations.items())
 
 
 def _pair_score(place: Float[np.ndarray, "n 3"], vessels: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n n"]:

@@ -73,7 +73,8 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     narrowest = _NARROWEST * blur_voxels(edges[::-1])
     reach = narrowest = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
     asked = np.concatenate([s.nodes for s in wanted])
-    nodes = _with_neighbours(lines, asked)
+    touching = lines.edges[np.isin(lines.edges, asked).any(axis=1)]
+    nodes = np.unique(np.concatenate([asked, touching.ravel()]))
     for growth in range(_MOST_GROWTHS):
         if growth:
             nodes = asked[_thin(result, lines, enough)[asked]]
@@ -168,13 +169,6 @@ def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "
     apart = lines.edges[part[lines.edges[:, 0]] != part[lines.edges[:, 1]]]
     thin[apart.ravel()] = True
     return thin
-
-
-def _with_neighbours(lines: MedialLines, nodes: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
-    chosen = np.zeros(len(lines.points), dtype=bool)
-    chosen[nodes] = True
-    touching = lines.edges[chosen[lines.edges].any(axis=1)]
-    return np.unique(np.concatenate([nodes, touching.ravel()]))
 
 
 def _widened_text(wide: list[Stretch], radius_mm: float) -> list[str]:

@@ -20,6 +20,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
+from endopilot.imaging.voxels import dilated
+
 COVERAGE = 1.6  # a path covers what lies within this many inscribed radii (and two grid steps) of it
 SLENDERNESS = 2.2  # a kept side branch reaches this many of its radii out of its parent's inscribed sphere
 TOGETHER = 0.5  # lines nearer each other than this share of the local radius run together and become one
@@ -258,8 +260,6 @@ def _levels(
 ) -> Int[np.ndarray, "n"]:
     """Return how coarse the grid may be at each point: every 2 to this power-th is enough where spheres of
     `_FINE_STEPS` such steps fill the lumen, away from narrower parts and from the root."""
-    from endopilot.imaging.grid import dilated  # brings SimpleITK, which simulating does without
-
     level = np.zeros(len(index), dtype=int)
     while (core := clearance > (wide := _FINE_STEPS * edges.max() * (1 << level.max()))).any():
         stride = 2 << level.max()

@@ -14,8 +14,7 @@ from endopilot.types import DistanceMap, Insertion
 from endopilot.vessels.coronary_ostia import Side, end_score
 from endopilot.vessels.ends import InletEnd, OpenEnd, likely_inlets, open_ends, skeleton_of
 from endopilot.vessels.graph import RootedGraph, lumen_graph
-from endopilot.vessels.surface import Surface
-from endopilot.vessels.surface_distance import distance_map_from_surface
+from endopilot.vessels.surface import Surface, distance_map_from_surface
 
 Vessel = Literal["rca", "lca", "generic"]
 

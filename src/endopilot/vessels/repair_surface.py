@@ -50,8 +50,10 @@ def closed_surface(
 ) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or that at the ostium), holes capped; arguments as of
     `connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near the ostium."""
-    mesh: Any = _without_duplicates(_polydata(surface.vertices, surface.faces).clean().triangulate())
-    mesh, remarks = _lumen_of(mesh)
+    mesh: Any = _polydata(surface.vertices, surface.faces).clean().triangulate()
+    faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)  # a triangle may stand there twice
+    mesh, remarks = _lumen_of(mesh if len(first) == len(faces) else _polydata(mesh.points, faces[np.sort(first)]))
     regions = mesh.connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"]).astype(np.int64)
     if ids.max() > 0:
@@ -167,14 +169,6 @@ def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
     ids = np.asarray(regions.point_data["RegionId"])
     sizes = np.bincount(ids)
     return [np.asarray(regions.points[ids == i][0], float) for i in np.argsort(-sizes)[:MOST_PIECES] if sizes[i] >= 100]
-
-
-def _without_duplicates(mesh):
-    faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    if len(first) == len(faces):
-        return mesh
-    return _polydata(mesh.points, faces[np.sort(first)])
 
 
 def _capped(mesh):

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError, place_text
-from endopilot.imaging.geometry import MM_PER_UNIT
 from endopilot.types import LumenMask, VesselTree
 from endopilot.vessels.surface import Surface
 
@@ -51,7 +50,15 @@ _CERTAIN, _FITS = 0.9, 0.05
 """A unit less probable than the first is asked for; the message names what has this share of the best one's chances."""
 
 _NONE = 1e-6  # likelihood of sizes that are no vessel's; those of a kind's medians have 1
-_NAMES = {**MM_PER_UNIT, "[in_i]": 25.4}  # mm in each unit, by its names; `[in_i]` is UCUM's inch, which Slicer writes
+_NAMES = {
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
+    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 1e-3),
+    **dict.fromkeys(("in", "inch", "inches", "[in_i]"), 25.4),
+}
+"""Millimetres in each unit of length by its names, in lower case; `[in_i]` is UCUM's inch, which Slicer writes."""
 
 
 @dataclass(frozen=True, eq=False)

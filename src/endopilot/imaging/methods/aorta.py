@@ -24,7 +24,6 @@ from endopilot.errors import InputError
 from endopilot.imaging.grid import (
     LEAST_BLOOD_HU,
     connected_components,
-    distance_and_nearest,
     distance_to_outside,
     interpolate_like,
     resample,
@@ -156,12 +155,13 @@ def _flood(
     contrast = hu > LEAST_BLOOD_HU
     off_path = np.ones(hu.shape, dtype=bool)
     off_path[tuple(path.T)] = False
-    distance, nearest = distance_and_nearest(off_path, _GRID_MM)
+    distance, nearest = ndimage.distance_transform_edt(off_path, sampling=_GRID_MM, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    distance = distance.astype(np.float32)
     radius_at_path = np.zeros(hu.shape, dtype=np.float32)
     radius_at_path[tuple(path.T)] = radius
     markers = np.zeros(hu.shape, dtype=np.int8)
     markers[contrast & (distance > _REACH_MM)] = 2
-    markers[contrast & (distance <= np.maximum(_CORE * radius_at_path[nearest], _GRID_MM))] = 1
+    markers[contrast & (distance <= np.maximum(_CORE * radius_at_path[tuple(nearest)], _GRID_MM))] = 1
     # Stents and calcium are brighter than blood; capped, they do not draw the flood.
     label = watershed(-np.minimum(hu, blood), markers, mask=contrast)
     return label == 1, label == 2

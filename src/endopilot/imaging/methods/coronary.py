@@ -31,13 +31,13 @@ from endopilot.imaging.coronary_doubts import FoundTree, Scan, coronary_doubts
 from endopilot.imaging.grid import (
     LEAST_BLOOD_HU,
     connected_components,
-    dilated,
     distance_to_outside,
     interpolate_like,
     resample,
 )
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.vessel_tracking import track_tree, vesselness
+from endopilot.imaging.voxels import dilated
 from endopilot.lines import length_along
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
@@ -84,11 +84,12 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         grid = resample(volume, _GRID_MM)
         roots = _find_roots(grid, config)
         advance()
-        scan, aorta, tree, start = (
-            _seeded_tree(volume, grid, roots, config.seeds[0])
-            if config.seeds
-            else _unseeded_tree(grid, roots, config.vessel)
-        )
+        if config.seeds:
+            scan = _find_vessels(grid, roots[0].blood_hu if roots else _hu_at(volume, config.seeds[0]))
+            aorta = _aorta(scan, roots[0]) if roots else np.zeros(scan.pools.shape, dtype=bool)
+            tree, start = _tree_at_seed(scan, aorta, config.seeds[0])
+        else:
+            scan, aorta, tree, start = _unseeded_tree(grid, roots, config.vessel)
         advance(2)
         ends = [_vessel_near(scan, tree, seed) for seed in config.seeds[1:]]
         paths = [
@@ -137,8 +138,10 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> Scan:
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
     above_fat = _FAT_HU + _LOW_SHARE * (lumen_hu - _FAT_HU)
     pools = _pools(body, above_muscle, grid)
-    # A small vessel in fat is dimmer than muscle, but visible where no thick tissue is.
-    thin = ((hu > above_muscle) & ~pools) | ((hu > above_fat) & ~_thick(body, above_fat, grid))
+    # A small vessel in fat is dimmer than muscle, but visible where no thick tissue is, in which a wide ball fits.
+    tissue = distance_to_outside(body.voxels > above_fat, _BODY_GRID_MM)
+    thick = _inside(_beyond_balls(tissue, _POOL_RADIUS_MM), body, grid)
+    thin = ((hu > above_muscle) & ~pools) | ((hu > above_fat) & ~thick)
     response = vesselness(
         np.clip(grid.voxels, _FAT_HU / 2, 1.1 * lumen_hu),
         thin,
@@ -159,12 +162,6 @@ def _pools(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz 
     core_depth = distance_to_outside(smooth > level_hu, _BODY_GRID_MM)
     from_core = _beyond_balls(core_depth, _CORE_RADIUS_MM) - _NEAR_CORE_MM
     return _inside(np.maximum(_beyond_balls(depth, _POOL_RADIUS_MM), from_core), body, grid)
-
-
-def _thick(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return where the tissue above a level is thick: the opening by a ball wider than most coronary arteries."""
-    depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
-    return _inside(_beyond_balls(depth, _POOL_RADIUS_MM), body, grid)
 
 
 def _beyond_balls(depth: Float[np.ndarray, "nz ny nx"], radius_mm: float) -> Float[np.ndarray, "nz ny nx"]:
@@ -193,12 +190,6 @@ def _aorta(scan: Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
 
 _Tree = tuple[Scan, Bool[np.ndarray, "nz ny nx"], Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]
 """The scan, the aorta in it, the connected vessel wanted, and its voxel nearest the aortic wall."""
-
-
-def _seeded_tree(volume: Volume, grid: Volume, roots: list[AorticRoot], seed: tuple[float, float, float]) -> _Tree:
-    scan = _find_vessels(grid, roots[0].blood_hu if roots else _hu_at(volume, seed))
-    aorta = _aorta(scan, roots[0]) if roots else np.zeros(scan.pools.shape, dtype=bool)
-    return scan, aorta, *_tree_at_seed(scan, aorta, seed)
 
 
 def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
