@@ -14,7 +14,7 @@ from endopilot.extras import require_extras
 from endopilot.settings import CountOrZero
 
 
-def command(
+def cockpit_command(
     patient: Positional[Existing | None] = None,
     /,
     *,

@@ -42,7 +42,7 @@ class RandomConfig:
     back, as `endopilot dataset` does. Given controls are made as they are."""
 
 
-def command(
+def simulate_command(
     anatomy: Positional[Existing],
     /,
     *,
