@@ -13,7 +13,7 @@ from packaging.utils import canonicalize_name
 
 from endopilot import __version__
 from endopilot.errors import InputError
-from endopilot.extras import extra_named, require_extras, requirements_of_extras, what_is_missing
+from endopilot.extras import extra_named, what_is_missing
 from endopilot.files import sha256
 from endopilot.navigation.baseline_policies import Forward
 from endopilot.navigation.policies import POLICIES, make_policy
@@ -224,11 +224,6 @@ def run_without(module: str, code: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_each_library_belongs_to_an_extra() -> None:
-    extras = requirements_of_extras()
-    assert "torch" in extras["learn"] and "gymnasium" in extras["env"] and "pydicom" in extras["imaging"]
-
-
 @pytest.mark.parametrize(
     ("module", "extra"),
     [
@@ -255,34 +250,11 @@ def test_a_defect_stays_a_defect() -> None:
     assert caught.value is error
 
 
-def test_a_command_names_the_extra_in_one_line() -> None:
-    result = run_without("torch", "from endopilot.cli import main; main(['train', 'dataset', '-o', 'run'])")
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert result.stderr == "endopilot train: needs torch; install it with: pip install 'endopilot[learn]'\n"
-
-
 def test_a_name_of_the_package_names_the_extra() -> None:
     result = run_without("torch", "import endopilot; endopilot.train")
     assert result.returncode == 1
     last = result.stderr.strip().splitlines()[-1]
     assert last == "ModuleNotFoundError: endopilot.train needs torch; install it with: pip install 'endopilot[learn]'"
-
-
-def test_all_extras_that_are_missing_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    present = {"learn": False, "env": True, "report": False}
-    monkeypatch.setattr("endopilot.extras.extras_present", lambda: present)
-    require_extras("env")
-    with pytest.raises(InputError, match=r"pip install 'endopilot\[learn,report\]'$"):
-        require_extras("learn", "env", "report")
-
-
-def test_a_run_says_so_before_it_begins(tmp_path: Path) -> None:
-    pytest.importorskip("torch", reason="the extra `learn` is not installed, which the line would name too")
-    result = run_without("plotly", f"from endopilot.cli import main; main(['demo', '-o', {str(tmp_path / 'demo')!r}])")
-    assert result.returncode == 2
-    assert result.stderr == "endopilot demo: needs more libraries; install them with: pip install 'endopilot[report]'\n"
-    assert not (tmp_path / "demo").exists()
 
 
 def of_base_install() -> set[str]:
@@ -310,18 +282,3 @@ def test_the_base_libraries_are_enough(tmp_path: Path) -> None:
     code = WITHOUT.format(hidden=hidden, script=str(script))
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_help_needs_no_extra() -> None:
-    commands = ["demo", "run", "dataset", "dataset-info", "train", "evaluate"]
-    code = (
-        "from endopilot.cli import main\n"
-        f"for command in {commands}:\n"
-        "    try: main([command, '--help'])\n"
-        "    except SystemExit as leaving: assert not leaving.code, command\n"
-        "    else: raise AssertionError(command)\n"
-    )
-    result = run_without("pyarrow", code)
-    assert result.returncode == 0, result.stderr
-    told = [line.split()[2] for line in result.stdout.splitlines() if line.startswith("usage: endopilot ")]
-    assert told == commands
