@@ -15,7 +15,6 @@ from endopilot import __version__
 from endopilot.errors import InputError
 from endopilot.extras import extra_named, what_is_missing
 from endopilot.files import sha256
-from endopilot.navigation.baseline_policies import Forward
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.plugins import Registry
 
@@ -58,27 +57,6 @@ def my_module(tmp_path, monkeypatch) -> Path:
         sys.modules.pop(name, None)
 
 
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """Return a function that installs a package which offers some entry points."""
-
-    def install(package: str, group: str, points: dict[str, str]) -> None:
-        folder = tmp_path / package
-        meta = folder / f"{package}-2.1.dist-info"
-        meta.mkdir(parents=True)
-        (meta / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 2.1\n")
-        lines = [f"{name} = {value}" for name, value in points.items()]
-        (meta / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines]) + "\n")
-        (folder / f"{package}_policies.py").write_text(
-            "from endopilot.navigation.baseline_policies import Forward\nclass Pushes(Forward):\n    pass\n"
-        )
-        monkeypatch.syspath_prepend(folder)
-
-    yield install
-    for name in [name for name in sys.modules if name.endswith("_policies") and "." not in name]:
-        del sys.modules[name]
-
-
 @pytest.mark.parametrize("name", ["my_module:Waits", "my_module:made"])
 def test_a_class_or_a_function_of_a_module_in_the_current_directory_makes_a_policy(my_module, name):
     policy = make_policy(name)
@@ -110,32 +88,6 @@ def test_what_is_no_policy_is_refused_in_one_line(my_module, name, expected):
     assert "\n" not in str(refusal.value)
 
 
-def test_an_installed_package_offers_a_policy_by_a_name(installed):
-    installed("pusher", "endopilot.policies", {"pusher": "pusher_policies:Pushes"})
-    assert POLICIES.names() == (*POLICIES.shipped, "pusher")
-    assert type(make_policy("pusher")).__name__ == "Pushes"
-    assert POLICIES.origin("pusher") == "pusher 2.1"
-
-
-def test_a_name_that_two_packages_offer_is_refused(installed):
-    installed("first", "endopilot.policies", {"pusher": "first_policies:Pushes", "forward": "first_policies:Pushes"})
-    installed("second", "endopilot.policies", {"pusher": "second_policies:Pushes"})
-    with pytest.raises(InputError, match="'pusher' is offered by second and by first; uninstall all but one"):
-        make_policy("pusher")
-    with pytest.raises(InputError, match="'forward' is offered by endopilot and by first"):
-        POLICIES.check("forward")
-    assert isinstance(make_policy("first_policies:Pushes"), Forward)
-    make_policy("spin")  # other names are not concerned
-
-
-def test_an_entry_point_that_leads_nowhere_is_refused(installed):
-    installed("astray", "endopilot.policies", {"astray": "astray_policies:Other", "bare": "astray_policies"})
-    with pytest.raises(InputError, match=r"policy: 'astray': .*astray_policies.py holds no Other"):
-        make_policy("astray")
-    with pytest.raises(InputError, match="policy: 'bare'"):
-        make_policy("bare")
-
-
 def test_an_origin_changes_with_the_file_of_a_policy(my_module):
     assert POLICIES.origin("forward") == f"endopilot {__version__}"
     before = POLICIES.origin("my_module:Waits")
@@ -154,7 +106,7 @@ def test_only_what_is_asked_for_is_imported():
 
 def test_a_shipped_object_that_is_missing_is_a_defect_and_no_bad_input():
     with pytest.raises(AttributeError):
-        Registry("policy", {"gone": "endopilot.navigation.policy:Gone"}, "endopilot.none").load("gone")
+        Registry("policy", {"gone": "endopilot.navigation.policy:Gone"}).load("gone")
 
 
 _RUDE = """

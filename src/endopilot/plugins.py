@@ -1,5 +1,5 @@
 """What a user may add without touching the package: `Registry` finds an implementation by its name, the package's own,
-an installed package's entry point, or MODULE:OBJECT, in the current directory or on Python's path."""
+or by MODULE:OBJECT, in the current directory or on Python's path."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,60 +23,24 @@ _LONGEST_MESSAGE = 200  # more of an exception's message is left out, characters
 @dataclass(frozen=True)
 class Registry:
     """Implementations of one thing by name. Messages begin with `setting`; `shipped` has MODULE:OBJECT of each of the
-    package's, imported if asked for; `group` is that of entry points by which installed packages offer theirs."""
+    package's, imported if asked for."""
 
     setting: str
     shipped: Mapping[str, str]
-    group: str
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of the package's own implementations, then those of installed packages."""
-        offered = sorted({point.name for point in entry_points(group=self.group)} - set(self.shipped))
-        return (*self.shipped, *offered)
+        """Return the names of the package's own implementations."""
+        return tuple(self.shipped)
 
     def load(self, name: str) -> Any:
-        """Return the object behind a name; InputError for no such name, one that two packages offer, or a module that
-        cannot be imported or lacks it."""
-        point = self._entry_point(name)
-        if point is not None:
-            return self._import(name, point.value)
+        """Return the object behind a name; InputError for no such name, or a module that cannot be imported or lacks
+        it."""
+        module_name, _, attribute = self.shipped.get(name, name).partition(":")
         if name in self.shipped:
-            module, _, attribute = self.shipped[name].partition(":")
-            return getattr(importlib.import_module(module), attribute)
-        return self._import(name, name)
-
-    def check(self, name: str) -> None:
-        """Refuse a name that `load` would refuse, without importing what the package ships."""
-        if self._entry_point(name) is not None or name not in self.shipped:
-            self.load(name)
-
-    def origin(self, name: str) -> str:
-        """Return where an implementation comes from: package and version, or a module's file and its SHA-256."""
-        point = self._entry_point(name)
-        if point is not None:
-            return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
-        if name in self.shipped:
-            return f"endopilot {__version__}"
-        self.load(name)
-        file = Path(sys.modules[name.partition(":")[0]].__file__ or "")
-        return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
-
-    def _entry_point(self, name: str) -> Any:  # an EntryPoint, of the standard library or of its backport; or None
-        points = {point.value: point for point in entry_points(group=self.group) if point.name == name}
-        owners = [point.dist.name if point.dist else value for value, point in points.items()]
-        owners = ["endopilot", *owners] if name in self.shipped else owners
-        if len(owners) > 1:
-            raise InputError(
-                f"{self.setting}: {name!r} is offered by {' and by '.join(owners)}; uninstall all but one, "
-                "or give MODULE:OBJECT"
-            )
-        return next(iter(points.values()), None) if name not in self.shipped else None
-
-    def _import(self, name: str, target: str) -> Any:
-        module_name, _, attribute = target.partition(":")
+            return getattr(importlib.import_module(module_name), attribute)
         if not attribute or not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
             raise InputError(
-                f"{self.setting}: {name!r}; choose from {', '.join(self.names())}, "
+                f"{self.setting}: {name!r}; choose from {', '.join(self.shipped)}, "
                 "or give MODULE:OBJECT, such as my_module:MyClass, of a module of your own"
             )
         module = self._module(name, module_name)
@@ -86,6 +49,19 @@ class Registry:
                 f"{self.setting}: {name!r}: {module.__file__ or module_name} holds no {attribute}; correct the name"
             )
         return getattr(module, attribute)
+
+    def check(self, name: str) -> None:
+        """Refuse a name that `load` would refuse, without importing what the package ships."""
+        if name not in self.shipped:
+            self.load(name)
+
+    def origin(self, name: str) -> str:
+        """Return where an implementation comes from: the package's version, or a module's file and its SHA-256."""
+        if name in self.shipped:
+            return f"endopilot {__version__}"
+        self.load(name)
+        file = Path(sys.modules[name.partition(":")[0]].__file__ or "")
+        return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
 
     def _module(self, name: str, module_name: str) -> ModuleType:
         here = str(Path.cwd())

@@ -28,7 +28,6 @@ METHODS = Registry(
         "nnunet": "endopilot.imaging.methods.programs:NNUNET",
         "totalsegmentator": "endopilot.imaging.methods.programs:TOTALSEGMENTATOR",
     },
-    group="endopilot.segmentation",
 )
 """Where the segmentation methods are. Each is a `SegmentationMethod`, or just its function `segment_lumen`."""
 _ROOT_MM = 5.0  # an ostium is on an aorta of 9 mm or more: nearer to the volume's edge, the root is cut off

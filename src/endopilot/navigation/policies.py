@@ -24,7 +24,6 @@ POLICIES = Registry(
         "cloned": "endopilot.control.cloned:ClonedPolicy",
         "open-loop": "endopilot.control.agent:OpenLoopPolicy",
     },
-    group="endopilot.policies",
 )
 """Where the classes of policies are. Each is made without arguments."""
 _METHODS = ("start", "decide")
