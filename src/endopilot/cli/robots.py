@@ -24,8 +24,7 @@ from endopilot.devices.stack import Stack
 from endopilot.files import input_hash, manifest, write_json, writing
 from endopilot.plotting import png
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
-from endopilot.robot.drive import Drive, tls_context
-from endopilot.robot.drive_server import serve
+from endopilot.robot.drive import Drive, serve, tls_context
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
 from endopilot.runs import check_new, claim
