@@ -233,9 +233,7 @@ def replay_prepared(
     ]
 
 
-def _expected(
-    of: Prepared, best: _Tried, driven: Float[np.ndarray, "episodes tips"]
-) -> list[Float[np.ndarray, "tips 3"]]:
+def _expected(of: Prepared, best: _Tried, driven: Float[np.ndarray, "episodes tips"]) -> list[Float[np.ndarray, "_ 3"]]:
     """Return where tips are expected: beside where kinematics lead them in the core's branch, or beside the core's tip,
     whichever was nearer to tips before.
 
