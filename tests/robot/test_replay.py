@@ -67,6 +67,14 @@ def test_tips_are_expected_beside_the_core_s_as_far_as_tips_before_were(fork, wi
         assert each.errors["in_view"] < 0.7 * np.median(each.core_mm[~each.given])
 
 
+def test_no_tip_that_is_not_given_is_read(fork, wire, robot, log) -> None:
+    one = next(log.episodes())
+    later = np.cumsum(one.seen) > 0.5 * one.seen.sum() + 1
+    moved = dataclasses.replace(one, tip=one.tip + np.outer(later, [0.0, 0.3, 0.0]))
+    (true,), (other,) = (replay_log([each], fork, Stack(wire), robot=robot, config=FEW) for each in (one, moved))
+    np.testing.assert_array_equal(other.predicted, true.predicted)
+
+
 def test_a_wire_keeps_its_rotation_from_one_episode_to_the_next(fork, wire, robot, made) -> None:
     """The same episode twice; the second time half of its tips are seen within 2 mm only, and tell no rotation."""
     log, true = made
