@@ -422,7 +422,7 @@ def _episode(
     of: Prepared,
     k: int,
     best: _Tried,
-    expected: Float[np.ndarray, "tips 3"],
+    expected: Float[np.ndarray, "seen 3"],
     driven: Float[np.ndarray, "tips"],
     rotation: tuple[float, float],
     ends: Float[np.ndarray, "periods"],
