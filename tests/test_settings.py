@@ -18,9 +18,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from pydantic import TypeAdapter, ValidationError, model_validator
+from pydantic import model_validator
 
 import endopilot
 from endopilot.devices.device import Wire, read_wire
@@ -226,23 +224,6 @@ def test_defaults_are_valid_and_settings_survive_records_copies_and_processes(ki
     assert pickle.loads(pickle.dumps(made)) == made
 
 
-@given(
-    low=st.integers(-50, 50),
-    span=st.integers(0, 50),
-    value=st.integers(-150, 150),
-    open_ends=st.tuples(st.booleans(), st.booleans()),
-)
-def test_a_number_is_taken_if_it_lies_in_the_range(low: int, span: int, value: int, open_ends) -> None:
-    within = Within(low, low + span, above_low=open_ends[0], below_high=open_ends[1])
-    for number in (int, float):
-        checked = TypeAdapter(Annotated[number, within])
-        if holds(within, value):
-            assert checked.validate_python(value) == value
-        else:
-            with pytest.raises(ValidationError):
-                checked.validate_python(value)
-
-
 @pytest.mark.parametrize(
     ("within", "whole", "words"),
     [
@@ -341,16 +322,6 @@ def test_a_file_is_read_and_its_faults_are_named(tmp_path: Path, suffix: str) ->
         read_settings(path, Bundle)
     with pytest.raises(InputError, match="no such file"):
         read_settings(tmp_path / f"none{suffix}", Bundle)
-
-
-def test_equality_can_be_by_identity() -> None:
-    @settings_class(eq=False)
-    class Alone:
-        """Equal to itself alone."""
-
-        count: Count = 1
-
-    assert Alone() != Alone()
 
 
 @pytest.mark.parametrize(

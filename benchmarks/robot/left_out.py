@@ -25,10 +25,8 @@ from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import input_hash
 from endopilot.robot.calibrate import bands, worst
 from endopilot.robot.kinematics import NAMES, Tracks, fit_drive, led
-from endopilot.robot.learned import Learned, LoggedEpisode, figures, left_out, logged
 from endopilot.robot.log import RobotLog, read_log
 from endopilot.robot.replay import EpisodeReplay, Prepared, ReplayConfig, prepare, replay_prepared, usable_episodes
 from endopilot.types import Anatomy
@@ -36,15 +34,7 @@ from endopilot.types import Anatomy
 REVERSES_MM, TURNS_RAD = 1.0, np.pi
 """A half counts as one that reverses where the drive goes so far both ways, and as one that turns where it turns so
 far."""
-MODELS = (
-    "an offset",
-    "play alone",
-    "kinematics",
-    "rod core",
-    "the paper's pair",
-    "learned, given half alone",
-    "learned",
-)
+MODELS = ("an offset", "play alone", "kinematics", "rod core", "replay", "the paper's pair")
 _RESAMPLES = 2000
 
 
@@ -57,11 +47,10 @@ class LeftOut:
         replay: by the rod core.
         along: error of Δtip by each of `MODELS`, mm, in the predicted half.
         in_plane: distance from the real tip, as the camera sees it, mm; kinematics have the tip on the centerline of
-            the real branch.
+            the real branch, `replay` beside it in the core's, by what tips before were.
         reverses: whether the drive reverses in that half.
         turns: whether it turns.
-        beside: the episode beside its replay.
-        states: of it, as the paper's pair takes them.
+        states: of the episode, as the paper's pair takes them.
     """
 
     log: RobotLog
@@ -70,7 +59,6 @@ class LeftOut:
     in_plane: dict[str, Float[np.ndarray, "tips"]]
     reverses: bool
     turns: bool
-    beside: LoggedEpisode
     states: States
 
 
@@ -100,13 +88,14 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
     at_tips = {"at_s": of.courses.seen_s, "latency_s": np.zeros(1), "gain": np.ones(1), "play": np.zeros(1)}
     drives = np.stack([of.courses.followed(axis, **at_tips)[0] for axis in (0, 1)], axis=-1)
     found = []
-    for k, (log, replay, beside) in enumerate(zip(of.logs, replays, logged(of, replays), strict=True)):
+    for k, (log, replay) in enumerate(zip(of.logs, replays, strict=True)):
         rest, count = ~replay.given, len(replay.given)
         lines = {branch: of.anatomy.tree.path(int(branch)) for branch in np.unique(replay.branch[:, 0])}
         along = {name: np.abs(replay.abscissa[:, 0] - each[k, :count])[rest] for name, each in simple.items()}
         along["rod core"] = np.abs(np.diff(replay.abscissa, axis=1)[rest, 0])
         _, ray = log.camera.rays(np.zeros((1, 2))) if log.camera else (None, np.zeros((1, 3)))
-        in_plane = {"rod core": np.linalg.norm(replay.in_view, axis=1)[rest]}
+        along["replay"] = along["kinematics"]
+        in_plane = {"rod core": replay.core_mm[rest], "replay": np.linalg.norm(replay.in_view, axis=1)[rest]}
         for name, each in simple.items():
             apart = -replay.seen
             for branch, line in lines.items():
@@ -120,9 +109,9 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
         turned = float(np.ptp(drive[:, 1])) if len(drive) else 0.0
         reverses = min(there[0], back[0]) > REVERSES_MM
         place = drives[k, :count] + [replay.abscissa[0, 0] - drives[k, 0, 0], log.command[log.commanded, 0, 1][0]]
-        tip = np.column_stack([replay.abscissa[:, 0], beside.apart[0, :, 1]])
+        tip = np.column_stack([replay.abscissa[:, 0], Sides(of.anatomy, _ray(log))(replay.seen)])
         states = States(log.name, tip, place, int(replay.given.sum()))
-        found.append(LeftOut(log, replay, along, in_plane, bool(reverses), turned > TURNS_RAD, beside, states))
+        found.append(LeftOut(log, replay, along, in_plane, bool(reverses), turned > TURNS_RAD, states))
     return found
 
 
@@ -161,57 +150,27 @@ def bench_left_out(
     for log in read:
         found = calibrated([each for each in read if each is not log], patient, known, episodes)
         of[log.name] = predicted(prepare(usable_episodes([log], patient), patient, 0.5, known), found, wire)
-    curve = _taught([one for each in of.values() for one in each], patient, input_hash(anatomy)[anatomy.name], epochs)
+    everything = [one for each in of.values() for one in each]
+    for one, made in zip(
+        everything, predict_left_out([each.states for each in everything], epochs=epochs), strict=True
+    ):
+        off = (made - one.states.tip)[~one.replay.given]
+        one.along["the paper's pair"], one.in_plane["the paper's pair"] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
     tables = []
     for name, each in of.items():
         others = [(one, other) for other, some in of.items() if other != name for one in some]
         width, _ = bands(_largest([one for one, _ in others]), [other for _, other in others])
         held = _largest(each) <= (np.inf if width is None else width)
         tables.append((name, held, _figures(each, patient)))
-    everything = [one for each in of.values() for one in each]
     tables.append(("all", np.concatenate([held for _, held, _ in tables]), _figures(everything, patient)))
     if write:
         fill("evidence/reality.md", "left-out", _table(tables))
-        fill("evidence/reality.md", "learned", _curve(curve))
     return [
         {"session": name, "model": model} | {key: cells[model] for key, cells in figures["errors"].items()}
         | {"band_holds": f"{held.mean():.2f} of {len(held)}"} | figures["of_the_core"]
         for name, held, figures in tables
         for model in MODELS
     ]  # fmt: skip
-
-
-def _taught(of: Sequence[LeftOut], anatomy: Anatomy, vessel: str, epochs: int) -> dict[str, dict[str, Any]]:
-    """Add what other sessions teach to episodes; return its figures by how many sessions teach, and what is known."""
-    for one, made in zip(of, predict_left_out([each.states for each in of], epochs=epochs), strict=True):
-        off = (made - one.states.tip)[~one.replay.given]
-        one.along["the paper's pair"], one.in_plane["the paper's pair"] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
-    beside, found = [each.beside for each in of], {}
-    count = len({each.log.name for each in of}) - 1
-    for name, number, before in [
-        *((f"{k} of them", k, True) for k in (1, 2, 4) if k < count),
-        ("learned", count, True),
-        ("learned, given half alone", count, False),
-    ]:
-        made = left_out(beside, vessel, sessions=number, before=before)
-        found[name] = figures(beside, made) | {"side_r": _side_r(of, made, anatomy)}
-        for one, learned in zip(of, made, strict=True):
-            rest, driven = ~one.replay.given, one.replay.driven[~one.replay.given]
-            one.along[name] = np.abs(one.replay.abscissa[rest, 0] - driven - learned.apart[:, 0])
-            one.in_plane[name] = np.linalg.norm(one.beside.apart[1, rest] - learned.apart, axis=1)
-    return found
-
-
-def _side_r(of: Sequence[LeftOut], made: Sequence[Learned], anatomy: Anatomy) -> str:
-    """Return the correlation of the learned tip's side with the real one's, where both are in the same branch."""
-    pairs = []
-    for one, learned in zip(of, made, strict=True):
-        rest, right = ~one.replay.given, one.beside.right[~one.replay.given]
-        tip = one.beside.at[1, rest] + (learned.apart[..., None] * one.beside.axes[1, rest]).sum(axis=1)
-        if right.any():
-            side = Sides(anatomy, _ray(one.log))
-            pairs.append((side(one.replay.seen[rest][right]), side(tip[right])))
-    return "{:.2f} [{:.2f}, {:.2f}]".format(*correlation(pairs))
 
 
 def _ray(log: RobotLog) -> Float[np.ndarray, "3"]:
@@ -246,12 +205,13 @@ def _figures(of: Sequence[LeftOut], anatomy: Anatomy) -> dict[str, Any]:
             ~each.replay.given & (each.replay.branch[:, 0] == each.replay.branch[:, 1]),
         )
         if used.any():
-            pairs.append((side(each.replay.seen[used]), side(each.replay.simulated[used])))
-    r, low, high = correlation(pairs) if pairs else (np.nan,) * 3
+            pairs.append([side(tip[used]) for tip in (each.replay.seen, each.replay.simulated, each.replay.predicted)])
+    r = [correlation([(one[0], one[k]) for one in pairs]) if pairs else (np.nan,) * 3 for k in (1, 2)]
     of_the_core = {
         "passages": f"{np.mean(taken):.2f} of {len(taken)}" if taken else "-",
         "ends_in_it": f"{np.mean(ends):.2f}",
-        "side_r": f"{r:.2f} [{low:.2f}, {high:.2f}]",
+        "side_r": "{:.2f} [{:.2f}, {:.2f}]".format(*r[0]),
+        "side_r_of_replay": "{:.2f} [{:.2f}, {:.2f}]".format(*r[1]),
     }
     return {"errors": errors, "of_the_core": of_the_core}
 
@@ -281,23 +241,6 @@ def _table(tables: list[tuple[str, Bool[np.ndarray, "episodes"], dict[str, Any]]
         f"| the real branch, of forks in two, passed in time, rod core | | {core['passages']} |",
         f"| episodes that end in the real branch, rod core | | {core['ends_in_it']} of {len(held)} |",
         f"| side of the tip, correlation, rod core | | {core['side_r']} |",
+        f"| side of the tip, correlation, replay | | {core['side_r_of_replay']} |",
     ]
-    return lines
-
-
-def _curve(of: dict[str, dict[str, Any]]) -> list[str]:
-    """Return what is learned by how many sessions teach, a row for each."""
-    lines = [
-        "| taught by | in the plane, mm | side of the tip, r | bands of 90 % hold, of tips | "
-        "jumps expected; real; skill | ends in the real branch expected; did; skill |",
-        "|---" * 6 + "|",
-    ]
-    for name, row in of.items():
-        title = name.replace("learned", "all others")
-        lines.append(
-            f"| {title} | {row['in_plane_of_learned_mm']:.2f} | {row['side_r']} | "
-            f"{row['bands_of_90_percent_hold_share']:.2f} | {row['jumps_expected']:.0f}; {row['jumps']}; "
-            f"{row['jumps_skill']:.2f} | {row['real_branch_ends_expected']:.0f}; {row['real_branch_ends']}; "
-            f"{row['real_branch_ends_skill']:.2f} |"
-        )
     return lines

@@ -304,8 +304,8 @@ def _advance(speed: float, samples: int) -> Float[np.ndarray, "samples"]:
 
 def _uniform(nodes: int, size_mm: float, bend: float, twist: float, *, shear: float, stretch: float) -> RodLayout:
     """Return a straight rod of 0.2 mm radius with one stiffness and next to no drag."""
-    section = {"bend": bend, "twist": twist, "shear": shear, "stretch": stretch}
-    return uniform_rod(nodes, size_mm, **section, radius_mm=0.2, drag=1e-6, spin_drag=1e-8)
+    section = {"bend_n_mm2": bend, "twist_n_mm2": twist, "shear_n": shear, "stretch_n": stretch}
+    return uniform_rod(nodes, size_mm, **section, radius_mm=0.2, drag_n_s_mm=1e-6, spin_drag_n_mm_s=1e-8)
 
 
 def _chamber(depth_mm: float, radius_mm: float) -> DistanceMap:

@@ -8,17 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from tyro.conf import Positional
 
 from endopilot.cli import COMMANDS, GROUPS, command_of, main
 from endopilot.cli.arguments import OutputFolder, show
-from endopilot.cli.options import LISTED, LISTED_AT_MOST, Command, Option
+from endopilot.cli.options import LISTED_AT_MOST, Command, Option
 from endopilot.errors import InputError
 from endopilot.files import read_yaml
 from endopilot.settings import Count, Positive, Seed, read_settings, settings
-from endopilot.simulation.trajectory import read_trajectory
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -83,11 +81,6 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["endopilot"]
-
-
-def test_a_missing_input_is_reported_in_one_line_by_a_process(tmp_path: Path) -> None:
-    assert_one_line(run("run", "missing.nii.gz", "-o", "out", cwd=tmp_path), "missing")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -202,13 +195,6 @@ def test_help_fits_a_head(command: Command) -> None:
     by_name = [leaf for one in command.options() for leaf in one.leaves() if not leaf.positional]
     assert len(everything) == len(by_name) and len({leaf.name for leaf in by_name}) == len(by_name)
     assert ("--help-all" in command.help(everything=False)) == (len(listed) < len(everything))
-
-
-def test_what_is_listed_are_options_of_commands_that_have_more() -> None:
-    for name, listed in LISTED.items():
-        command = command_of(name)
-        names = [leaf.name for one in command.options() for leaf in one.leaves() if not leaf.positional]
-        assert set(listed.split()) <= set(names) and len(names) > LISTED_AT_MOST
 
 
 @pytest.mark.parametrize("command", EVERY, ids=lambda command: command.name)
@@ -330,13 +316,3 @@ def test_random_navigations_stop_short_of_ends_unless_asked_otherwise(vessel, tm
         assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= deepest_mm + 0.5
     else:
         assert "worlds_stopped_short" not in figures and figures["deepest_tip_mm"] >= deepest_mm
-
-
-def test_a_random_navigation_is_written_with_its_shapes(vessel, tmp_path, capsys):
-    options = ("--sequences", "1", "--seconds", "5", "--seed", "1", "--shape", "--json")
-    with pytest.raises(SystemExit) as leaving:
-        main(["simulate", str(vessel), "-o", str(tmp_path / "run.npz"), *options])
-    assert leaving.value.code == 0 and json.loads(capsys.readouterr().out)["worlds_stopped_short"] >= 0
-    made = read_trajectory(tmp_path / "run.npz")
-    assert made.shape is not None
-    np.testing.assert_array_equal(made.shape[:, :, 0], made.tip_position[:, :, 0])

@@ -118,19 +118,6 @@ def test_a_phase_is_chosen(few, tmp_path, capsys):
     refused(capsys, "run", phases, "-o", tmp_path / "run")
 
 
-def test_volumes_that_miss_the_ostium(enhanced, tmp_path, capsys):
-    """The ostium is at the origin: one volume begins above it, one ends below the whole aorta."""
-    whole = read_volume(enhanced)
-    height = whole.index_to_world(np.stack([np.zeros(len(whole.voxels))] * 2 + [np.arange(len(whole.voxels))], -1))[
-        :, 2
-    ]
-    for name, kept in {"above": height > 4.0, "below": height < -45.0}.items():
-        first = whole.index_to_world(np.array([0.0, 0.0, float(kept.argmax())]))
-        write_volume(Volume(whole.voxels[kept], whole.spacing_mm, first, whole.direction), tmp_path / f"{name}.nii.gz")
-        line = _refused(capsys, tmp_path / f"{name}.nii.gz")
-        assert "seeds: the ostium first" in line or "the ostium is probably outside; give a CT" in line, line
-
-
 def test_a_mask_made_elsewhere_becomes_an_anatomy(tmp_path, capsys):
     """Without sidecar, in any format, DICOM-SEG among them; a first seed given later is the ostium."""
     pytest.importorskip("highdicom", reason="DICOM-SEG needs highdicom (the extra dicom-seg)")

@@ -23,7 +23,6 @@ from endopilot.files import read_json
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_page import navigation_figure
-from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory import read_trajectory
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
@@ -263,12 +262,6 @@ def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_p
     run(capsys, "dataset", patient, "-o", tmp_path / "long", "--sequences", "4", "--seconds", "30")
     line = refused(capsys, "train", tmp_path / "long", folder / "episode", "-o", tmp_path / "no")
     assert "episodes of 20 s, and those of" in line and "--seconds 30" in line
-
-
-def test_the_episode_of_a_moving_patient_names_the_motion(patient, capsys, tmp_path):
-    moved = ("--motion", "both", "--motion-seed", "3", "--policy", "forward", "--tip", "own", "--seconds", "5")
-    run(capsys, "navigate", patient, "--target", "2", *moved, "-o", tmp_path / "moving")
-    assert read_dataset(tmp_path / "moving" / "episode").motion(patient.name) == motion_named("both", 3)
 
 
 def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):

@@ -86,17 +86,6 @@ def test_a_finished_anatomy_is_made_again_from_the_same_mask_alone(mask, capsys,
     assert content(folder) == before
 
 
-def test_a_plan_is_made_again_for_the_same_target_alone(patient, capsys, tmp_path):
-    folder = tmp_path / "plan"
-    run(capsys, "plan", patient, "--target", "ICA", "-o", folder)
-    (folder / "notes.txt").write_text("kept")
-    before = content(folder)
-    assert "was begun with target = ICA" in refused(capsys, "plan", patient, "--target", "M1", "-o", folder)
-    assert content(folder) == before
-    run(capsys, "plan", patient, "--target", "ICA", "-o", folder)
-    assert (folder / "notes.txt").read_text() == "kept"
-
-
 def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(patient, capsys, tmp_path):
     table, before = tmp_path / "rollout.csv", content(patient)
     table.write_text("theirs")

@@ -16,18 +16,14 @@ import numpy as np
 import pydicom
 import pytest
 
-from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
 from endopilot.imaging.volume import read_mask, write_volume
 from endopilot.models.config import TrainConfig
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline import study
-from endopilot.pipeline.study import DemoConfig
-from endopilot.runs import claim
 from endopilot.types import Volume
 
 STAGES = ["read", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
@@ -122,22 +118,6 @@ def test_another_patient_is_refused_though_the_file_s_name_is_the_same(case, unt
     assert f"{case / 'run'}: was begun with volume_sha256 = " in line
 
 
-def test_another_device_in_the_same_file_is_refused(case, untouched, capsys):
-    text = (case / "wire.yaml").read_text()
-    (case / "wire.yaml").write_text(text.replace("value: 0.36", "value: 0.35", 1))
-    assert (case / "wire.yaml").read_text() != text
-    try:
-        line = command.refused(capsys, *arguments(case))
-        assert "was begun with device.diameter_mm = 0.36, now it is 0.35" in line
-    finally:
-        (case / "wire.yaml").write_text(text)
-
-
-def test_another_setting_is_refused(case, untouched, capsys):
-    line = command.refused(capsys, *arguments(case), "--seed", "7")
-    assert "was begun with config.seed = 1, now it is 7" in line
-
-
 def test_another_series_is_refused(tmp_path, capsys):
     study = tmp_path / "study"
     for number in (1, 2):
@@ -203,16 +183,3 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkey
     finished = (folder / "report.html").stat().st_mtime_ns
     assert command.run(capsys, "demo", "-o", folder, *OF_DEMO) == again
     assert (folder / "report.html").stat().st_mtime_ns == finished
-
-
-def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
-    claim(
-        tmp_path,
-        "endopilot demo",
-        config=DemoConfig(patients=6),
-        device=read_wire("workhorse-014"),
-        version=__version__,
-    )
-    (tmp_path / "stages.json").write_text("{}")
-    line = command.refused(capsys, "demo", "-o", tmp_path, *OF_DEMO)
-    assert f"was begun with config.sequences = {DemoConfig().sequences}, now it is 1" in line

@@ -131,25 +131,6 @@ def test_a_command_is_held_while_its_caller_waits(drive, certificates) -> None:
         wait_for(process, ": silence;")
 
 
-def test_a_drive_that_was_held_up_stops_and_arming_alone_does_not_move_it(drive, certificates) -> None:
-    process, port = drive
-    with RemoteRobot(HOST, port, certificates) as robot:
-        for stopping in (signal.SIGSTOP, None):
-            robot.arm()
-            robot.command(((10.0, 0.0),))
-            if stopping is not None:
-                process.send_signal(stopping)
-                time.sleep(0.3)
-                process.send_signal(signal.SIGCONT)
-                wait_for(process, ": silence;")
-            else:
-                robot.stop()
-            robot.arm()
-            robot.run(0.2)
-            time.sleep(0.2)
-            assert moved(robot, 0.3) < 0.2
-
-
 def test_any_thread_may_call_it(drive, certificates) -> None:
     _, port = drive
     failures: list[Exception] = []

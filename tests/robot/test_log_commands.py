@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import pandas as pd
 import pytest
@@ -14,7 +13,6 @@ from endopilot.cli import main
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
 from endopilot.files import read_json
-from endopilot.robot.learned import read_learned
 
 
 @pytest.fixture(scope="module")
@@ -54,33 +52,6 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
     assert read_json(made / "manifest.json")["figures"] == replayed
     with Image.open(made / "replay.png") as picture:
         assert min(picture.size) > 400
-
-
-def test_what_logs_teach_is_learned_and_judged_on_logs_left_out(vessel, log_file, tmp_path, capsys) -> None:
-    folder = tmp_path / "logs"
-    folder.mkdir()
-    for name in ("monday", "tuesday"):
-        shutil.copy(log_file, folder / f"{name}.csv")
-    found = run(capsys, "train", "--logs", folder, "--anatomy", vessel, "-o", tmp_path / "run")
-    assert [row["sessions"] for row in found["curve"]] == [1] and found["logs_left_out_say"] in ("gain", "no gain")
-    assert found["curve"][0]["in_plane_of_learned_mm"] < 1.0
-    model = read_learned(tmp_path / "run/learned.npz")
-    assert model.sessions == ("monday", "tuesday")
-    assert model.vessel == read_json(tmp_path / "run/manifest.json")["inputs"][vessel.name]
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [((), "dataset: give folders"), (("--logs", "log.csv"), "anatomy: logs need the vessel")],
-)
-def test_training_on_nothing_or_in_no_vessel_is_refused(
-    given, message, log_file, tmp_path, capsys, monkeypatch
-) -> None:
-    monkeypatch.chdir(log_file.parent)
-    with pytest.raises(SystemExit) as leaving:
-        main(["train", *given, "-o", str(tmp_path / "run")])
-    assert leaving.value.code == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 def test_a_log_that_is_not_there_is_named(vessel, tmp_path, capsys) -> None:

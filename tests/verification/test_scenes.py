@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from benchmarks.verification import scenes as scenarios
 from benchmarks.verification.transmission import LAG_RAD, turn
-from benchmarks.verification.tubes import ELEMENTS, Sliding, Uniform, curvature, drive, lay_out, mesh
+from benchmarks.verification.tubes import ELEMENTS, Uniform, drive, lay_out, mesh
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
@@ -18,15 +18,6 @@ from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
 from endopilot.verification import free_rod
 from endopilot.verification.case import Loading
-
-
-def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:
-    # T2/T1 = exp(µ θ), θ the sum of all angles that the string turns by, whatever their direction
-    for bends, friction in ((0, 0.2), (3, 0.2), (6, 0.2), (4, 0.4)):
-        run = scenarios.drag_through_bends(bends, friction=friction)
-        assert run.ratio == pytest.approx(np.exp(friction * run.wire_turning_rad), rel=0.01)
-        # it cuts every bend but by no more than the vessel's width lets it
-        assert 0.5 * run.axis_turning_rad <= run.wire_turning_rad <= run.axis_turning_rad + 1e-6
 
 
 def test_a_stiff_wire_is_dragged_more_than_a_string() -> None:
@@ -83,15 +74,6 @@ def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:
     assert run.force_n[run.pushed_mm > 1.0][0] < 0.2 * run.force_n.max()
 
 
-def test_friction_keeps_twist() -> None:
-    # |T'| <= m everywhere: a device at rest neither creeps nor unwinds
-    path = np.concatenate([np.linspace(0.0, 1.7 * LAG_RAD, 20), np.full(50, 1.7 * LAG_RAD)])
-    rotation, torque = turn(path)
-    assert 0 < rotation[19] < path[19]
-    assert rotation[20:] == pytest.approx(rotation[19], abs=1e-9)
-    assert torque[20:] == pytest.approx(torque[19], abs=1e-9)
-
-
 def test_what_the_ostium_does_depends_on_the_path_alone() -> None:
     # rate independence: where the path of the drive is cut into more steps, it ends the same
     corners = np.array([0.0, 5.0, 1.5, 3.0, -4.0, 0.5])
@@ -122,14 +104,6 @@ ELASTICA = {
     40: (0.907371, 0.776395),
 }
 """Deflection w/L and shortening u/L of a clamped rod of 100 elements, by α = F L²/EI."""
-
-
-@pytest.mark.parametrize(("name", "tip"), [("P=300", (-7.045, -11.932, 40.192)), ("P=600", (-13.605, -23.561, 53.475))])
-def test_bend_of_45_degrees(name: str, tip: tuple[float, ...]) -> None:
-    # Bathe and Bolourchi (1979), converged; the error is the distance of the tips over the tip's displacement.
-    case = next(case for case in free_rod.bend_of_45_degrees() if case.case.endswith(name))
-    assert case.reference == pytest.approx(np.linalg.norm(tip), rel=1e-4)
-    assert case.error <= 3e-3
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0, 5.0, 10.0])
@@ -188,35 +162,6 @@ def test_the_push_balances_the_wall() -> None:
     assert np.abs(push + wall).max() < 0.01 * np.abs(push).max() + 1e-4, (push, wall)
 
 
-def test_three_precurved_tubes_lie_where_their_moments_balance() -> None:
-    # Σ EIk (κ - κk) = 0: κ = Σ EIk κk / Σ EIk, with the third opposed
-    stack = (Uniform(30.0, 24.0, 0.02), Uniform(50.0, 40.0, 0.01), Uniform(20.0, 16.0, 0.03))
-    rod = mesh(20.0)
-    result = drive(rod, lay_out(stack, 20.0), np.full(3, 20.0), rotation=np.array([0.0, 0.0, np.pi]))
-    expected = (30 * 0.02 + 50 * 0.01 - 20 * 0.03) / 100
-    found = curvature(result["shape"][-1][:ELEMENTS], float(rod.abscissa_mm[1]))
-    assert found == pytest.approx(np.full(len(found), expected), rel=1e-5)
-    assert np.abs(result["base_torque"][-1]).max() < 1e-6  # no torque: the opposed tube is in balance there
-
-
-def test_the_catheter_slides_over_a_bent_wire_and_straightens_it() -> None:
-    # Curvature of the stretch that a straight catheter covers: EIw κw / (EIw + EIc); beyond its end the wire's own.
-    wire, catheter, length, covered = Uniform(20.0, 16.0, 0.03), Uniform(60.0, 48.0), 30.0, 18.3
-    rod = mesh(length)
-    control = np.zeros((14, 2, 2))
-    control[1:13, 1, 0] = covered / 12 / 0.5
-    result = drive(rod, lay_out((wire, catheter), length), np.array([length, 0.0]), control=control)
-    size = float(rod.abscissa_mm[1])
-    found = curvature(result["shape"][-1][:ELEMENTS], size)
-    joints = rod.abscissa_mm[1 : ELEMENTS - 1]
-    ahead, behind = joints < length - covered - size, joints > length - covered + size
-    assert found[ahead] == pytest.approx(np.full(ahead.sum(), wire.curvature), rel=1e-5)
-    assert found[behind] == pytest.approx(np.full(behind.sum(), 20 * 0.03 / 80), rel=1e-5)
-    # where it ends in a joint, the angle there is that of both parts
-    (between,) = found[~ahead & ~behind][[int(np.argmin(np.abs(joints[~ahead & ~behind] - (length - covered))))]]
-    assert 20 * 0.03 / 80 < between < wire.curvature
-
-
 def test_it_does_not_matter_which_tip_is_foremost() -> None:
     # The stack (wire ahead of catheter) and the stack with the same two tubes in each other's places are the same rod.
     first, second, length = Uniform(20.0, 16.0, 0.02), Uniform(60.0, 48.0, 0.01), 30.0
@@ -225,12 +170,6 @@ def test_it_does_not_matter_which_tip_is_foremost() -> None:
         result = drive(rod, lay_out(stack, length), np.array(inserted))
         shapes.append(result["shape"][-1][:ELEMENTS])
     assert shapes[1] == pytest.approx(shapes[0], abs=1e-8)
-
-
-def test_pushed_in_a_wire_keeps_less_than_its_load() -> None:
-    # The friction of the way in is kept at rest: the pull is exp(-µθ) times the load on the tip.
-    pull, _ = Sliding(0.25, 1.2).drive((0.0, 0.0), 2)
-    assert pull[-1] == pytest.approx(np.exp(-0.25 * 1.2), rel=0.01)
 
 
 def test_a_catheter_on_a_bent_wire_is_pushed_back() -> None:

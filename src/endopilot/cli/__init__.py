@@ -1,6 +1,6 @@
-"""The command line: one file a command, each a thin wrapper of a stage's entry function.
+"""The command line: a function for each command, a thin wrapper of a stage's entry function.
 
-Only the command that is called is imported, so that `endopilot --help` and `endopilot info` are fast.
+Only the module of the command that is called is imported, so that `endopilot --help` and `endopilot info` are fast.
 """
 
 from __future__ import annotations
@@ -52,7 +52,17 @@ COMMANDS = {
     "completion": "a script with which bash and zsh complete commands and options",
     "info": "versions and machine",
 }
-"""Name of each command: what it takes -> what it makes. `module_of` names its module."""
+"""Name of each command: what it takes -> what it makes."""
+_TOGETHER = {
+    "stages": "demo run",
+    "patients": "segment anatomy atlas phantom",
+    "data": "dataset dataset-info train evaluate",
+    "navigation": "plan navigate",
+    "images": "xray locate angiograms advise",
+    "robots": "drive replay calibrate",
+    "checks": "verify devices sample",
+}
+"""Modules of several commands; all others have a module of their own name."""
 GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models"}
 GROUPS |= {
     "difficulty": "Navigation",
@@ -92,16 +102,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     leave(code) if is_process else sys.exit(code)
 
 
-def module_of(name: str) -> str:
-    """Return the name of the module that holds a command."""
-    return name.replace("-", "_")
-
-
 def command_of(name: str) -> Command:
     """Return a command by its name."""
     from endopilot.cli.options import Command  # tyro and pydantic are slow to import
 
-    return Command(f"endopilot {name}", importlib.import_module(f"endopilot.cli.{module_of(name)}").command)
+    module = next((module for module, names in _TOGETHER.items() if name in names.split()), name)
+    functions = vars(importlib.import_module(f"endopilot.cli.{module}"))
+    return Command(f"endopilot {name}", functions[f"{name.replace('-', '_')}_command"])
 
 
 def overview() -> str:

@@ -15,7 +15,7 @@ from endopilot.extras import require_extras
 from endopilot.settings import CountOrZero, Within
 
 
-def command(
+def cockpit_command(
     patient: Positional[Existing | None] = None,
     /,
     *,

@@ -19,7 +19,7 @@ complete -o default -F _endopilot endopilot
 """
 
 
-def command() -> None:
+def completion_command() -> None:
     """Print a script with which bash and zsh complete commands, options and choices; files where none of them fits.
 
     `endopilot completion > ~/.endopilot-completion`, and `source ~/.endopilot-completion` in ~/.bashrc or ~/.zshrc.

@@ -10,7 +10,9 @@ from endopilot.control.difficulty import arch_type, difficulty
 from endopilot.devices.device import read_wire
 
 
-def command(anatomy: Positional[Existing], /, *, target: tuple[str, ...] = (), device: str = "workhorse-014") -> Answer:
+def difficulty_command(
+    anatomy: Positional[Existing], /, *, target: tuple[str, ...] = (), device: str = "workhorse-014"
+) -> Answer:
     """Say before a procedure how hard each section of a vessel is to reach with a wire alone, the easiest first.
 
     Exposures and seconds are those that the policy `agent` would take, with intervals of 80 %, by what the navigations

@@ -8,7 +8,7 @@ from endopilot.extras import extras_present
 from endopilot.files import manifest
 
 
-def command() -> Figures:
+def info_command() -> Figures:
     """Print versions, machine, the level of the rod core for this processor, and which extras are installed."""
     facts = manifest(config=None)
     figures = {"commit": facts["commit"], **facts["versions"], **facts["machine"], "core": _core.LEVEL}

@@ -12,7 +12,7 @@ from endopilot.extras import extras_present, require_extras
 from endopilot.ladder.ladder import LadderConfig, climb
 
 
-def command(
+def ladder_command(
     *,
     output: OutputFolder | None = None,
     mismatch: float = 0.0,

@@ -67,7 +67,7 @@ TOOLS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 figures are rows."""
 
 
-def command(folder: Positional[Existing], /) -> None:
+def mcp_command(folder: Positional[Existing], /) -> None:
     """Serve ten tools to an assistant on standard input and output, until it closes them. For research.
 
     Args:

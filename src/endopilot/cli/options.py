@@ -41,7 +41,7 @@ LISTED: Mapping[str, str] = MappingProxyType(
         "phantom": "output seed in_plane_mm slice_mm lumen_hu noise_hu calcium stents motion_mm json",
         "simulate": "output device catheter controls sequences seconds seed motion picture json",
         "dataset": "output device catheter sequences seconds seed control friction motion json",
-        "train": "output logs anatomy robot device epochs batch_size max_seconds seed json",
+        "train": "output network epochs batch_size max_seconds seed json",
         "plan": "target output device catheter model method seconds force_limit_n xray json",
         "navigate": "target output policy device catheter world robot xray seed json",
         "ladder": "output policy tasks patients version robot world table check json",

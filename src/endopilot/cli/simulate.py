@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -21,7 +21,7 @@ from endopilot.progress import progress
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
-from endopilot.simulation.motion import Motion, MotionName, motion_named
+from endopilot.simulation.motion import MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_worlds
 from endopilot.simulation.trajectory import Trajectory, read_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
@@ -42,7 +42,7 @@ class RandomConfig:
     back, as `endopilot dataset` does. Given controls are made as they are."""
 
 
-def command(
+def simulate_command(
     anatomy: Positional[Existing],
     /,
     *,
@@ -76,16 +76,9 @@ def command(
         require_extras("report")
     patient = read_anatomy(anatomy)
     stack = Stack.of(device or "workhorse-014", *catheter)
-    moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
-    recorded = None
-    if controls is not None and (controls.is_dir() or controls.suffix == ".npz"):
-        recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
-        patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
-        initial, control = recorded.set_up.initial, recorded.command
-    elif controls is not None:
-        script = read_controls_csv(controls, devices=len(stack))
-        initial, control, period_s = script.initial, script.control, script.period_s
-    else:
+    moves, stopped = motion_named(motion, motion_seed), None
+    also: dict[str, Any] = {"motion": moves, "record_shape": shape or picture is not None}
+    if controls is None:
         initial, control = random_controls(
             ControlConfig(),
             devices=len(stack),
@@ -94,24 +87,24 @@ def command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-    trajectory, stopped, record_shape = None, None, shape or picture is not None
-    if controls is None and random.stop_short:
-        trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config, record_shape)
-    if recorded is not None:
-        others = {"motion": moves, "config": None if config == SimulatorConfig() else config}
-        others = {name: value for name, value in others.items() if value is not None}
-        trajectory = recorded.replay(record_shape=record_shape, **others)
-    elif trajectory is None:
-        trajectory = simulate(
-            patient,
-            stack,
-            control,
-            initial=initial,
-            config=config,
-            record_shape=record_shape,
-            period_s=period_s,
-            motion=moves,
-        )
+        if random.stop_short:
+            worlds, samples = control.shape[:2]
+            frictions = stack.frictions(np.full(worlds, stack.wire.friction))
+            with progress("Simulating the wire", total=worlds * samples) as advance:
+                trajectory, stopped = simulate_navigations(
+                    patient, [stack] * worlds, initial, control, frictions, config, advance=advance, **also
+                )
+        else:
+            trajectory = simulate(patient, stack, control, initial=initial, config=config, **also)
+    elif controls.is_dir() or controls.suffix == ".npz":
+        recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
+        patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
+        also |= {"config": None if config == SimulatorConfig() else config}
+        trajectory = recorded.replay(**{name: value for name, value in also.items() if value is not None})
+    else:
+        script = read_controls_csv(controls, devices=len(stack))
+        also |= {"initial": script.initial, "period_s": script.period_s}
+        trajectory = simulate(patient, stack, script.control, config=config, **also)
     (trajectory if shape else replace(trajectory, shape=None)).write(output)
     valid, force, torque = trajectory.valid, np.abs(trajectory.base_force), np.abs(trajectory.base_torque)
     figures = {
@@ -155,30 +148,6 @@ def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
             f"device: {path} was made with another ({made_with}), not with this {asked.name}; leave it out"
         )
     return recorded
-
-
-def _stopped_short(
-    patient: Anatomy,
-    stack: Stack,
-    initial: np.ndarray,
-    control: np.ndarray,
-    motion: Motion | None,
-    config: SimulatorConfig,
-    record_shape: bool,
-) -> tuple[Trajectory, np.ndarray]:
-    worlds, samples = control.shape[:2]
-    with progress("Simulating the wire", total=worlds * samples) as advance:
-        return simulate_navigations(
-            patient,
-            [stack] * worlds,
-            initial,
-            control,
-            stack.frictions(np.full(worlds, stack.wire.friction)),
-            config,
-            motion=motion,
-            record_shape=record_shape,
-            advance=advance,
-        )
 
 
 def _largest(values: np.ndarray, valid: np.ndarray) -> float | None:

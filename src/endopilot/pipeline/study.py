@@ -169,12 +169,17 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     )
     atlas = AtlasConfig(vessel="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
-    draw = partial(_make_patient, config=atlas, truths=truths)
-    scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)
-    run.stages.do_each("atlas", "Synthetic patients", truths, draw)
-    run.stages.do_each("phantom", "Synthetic CT angiograms", truths, scan)
-    anatomies = _anatomies(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths])
-    run.stages.do("navigation", lambda: _drive(run, anatomies[0]))
+    volumes = [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]
+    run.stages.do_each("atlas", "Synthetic patients", truths, partial(_make_patient, config=atlas))
+    run.stages.do_each("phantom", "Synthetic CT angiograms", volumes, partial(_make_volume, config=atlas))
+    anatomies = _anatomies(run, volumes)
+
+    def drive() -> None:
+        tree = read_anatomy(anatomies[0]).tree
+        target = tree.section_names[tree.branches[tree.longest_leaf()].section[-1]]
+        _navigate(run, anatomies[0], target)
+
+    run.stages.do("navigation", drive)
     return _study(run, anatomies)
 
 
@@ -215,12 +220,8 @@ def run_volume(
         navigation=folder,
     )
     anatomies = _anatomies(run, [copy])
-    if target is None or folder is None:
-        return _study(run, anatomies)
-    settings = NavigateConfig(seed=config.seed)
-    navigation = navigate_into(anatomies[0], target, output=folder, device=config.device, config=settings)
-    found = _study(run, anatomies)
-    return {"outcome": navigation["outcome"], "page": navigation["page"], **found}
+    navigation = {} if target is None else _navigate(run, anatomies[0], target)
+    return {name: navigation[name] for name in ("outcome", "page") if name in navigation} | _study(run, anatomies)
 
 
 def _digest(volume: Volume) -> str:
@@ -231,61 +232,58 @@ def _digest(volume: Volume) -> str:
     return digest.hexdigest()
 
 
-def _make_patient(folder: Path, *, config: AtlasConfig, truths: Sequence[Path]) -> None:
+def _number(path: Path) -> int:
+    """Return a synthetic patient's number, from 0 on, by the name of its folder or volume."""
+    return int(path.name.removesuffix(VOLUME_SUFFIX).rpartition("-")[2]) - 1
+
+
+def _make_patient(folder: Path, *, config: AtlasConfig) -> None:
     if not folder.exists():
-        write_anatomy(make_patient(config, truths.index(folder)), output=folder)
+        write_anatomy(make_patient(config, _number(folder)), output=folder)
 
 
-def _make_volume(folder: Path, *, output: Path, seed: int, truths: Sequence[Path]) -> None:
-    path = output / "ct" / f"{folder.name}{VOLUME_SUFFIX}"
-    if not path.exists():
-        seed = seed * len(truths) + truths.index(folder)
-        write_volume(make_phantom(read_anatomy(folder), config=PhantomConfig(), seed=seed), path)
+def _make_volume(volume: Path, *, config: AtlasConfig) -> None:
+    if not volume.exists():
+        seed, truth = config.seed * config.count + _number(volume), _beside(volume, "truth")
+        write_volume(make_phantom(read_anatomy(truth), config=PhantomConfig(), seed=seed), volume)
 
 
-def _make_mask(volume: Path, *, output: Path, config: SegmentConfig, notes: tuple[str, ...]) -> None:
-    path = output / "masks" / volume.name
+def _make_mask(volume: Path, *, config: SegmentConfig, notes: tuple[str, ...]) -> None:
+    path = _beside(volume, "masks", VOLUME_SUFFIX)
     if not path.exists():
         mask = segment(replace(read_volume(volume), notes=notes), config=config)
         write_mask(mask, path, manifest=manifest(config=config, inputs=input_hash(volume)))
 
 
-def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
-    name = volume.name.removesuffix(VOLUME_SUFFIX)
-    mask, folder = output / "masks" / volume.name, output / "anatomies" / name
+def _make_anatomy(volume: Path, *, config: AnatomyConfig) -> None:
+    mask, folder = _beside(volume, "masks", VOLUME_SUFFIX), _beside(volume, "anatomies")
     if mask.exists() and not folder.exists():
-        write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), output=folder)
+        write_anatomy(extract_anatomy(read_source(mask), name=folder.name, config=config), output=folder)
+
+
+def _beside(volume: Path, folder: str, suffix: str = "") -> Path:
+    """Return where else a study keeps what belongs to a patient's volume or anatomy."""
+    return volume.parents[1] / folder / f"{volume.name.removesuffix(VOLUME_SUFFIX)}{suffix}"
 
 
 def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
     """Segment volumes, extract their anatomies, and return the folders of those where both succeeded."""
-    output, stages, segmentation = run.output, run.stages, run.segmentation
-    scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
-    make_mask = partial(_make_mask, output=output, config=segmentation, notes=run.notes)
-    make_anatomy = partial(_make_anatomy, output=output, config=AnatomyConfig(vessel=scheme))
-    stages.do_each("segmentation", "Segmentation", volumes, make_mask)
-    stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
-    names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]
-    return [output / "anatomies" / name for name in names if (output / "anatomies" / name).exists()]
+    scheme = run.segmentation.vessel if run.segmentation.method == "coronary" else "generic"
+    make_mask = partial(_make_mask, config=run.segmentation, notes=run.notes)
+    make_anatomy = partial(_make_anatomy, config=AnatomyConfig(vessel=scheme))
+    run.stages.do_each("segmentation", "Segmentation", volumes, make_mask)
+    run.stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
+    return [folder for folder in (_beside(volume, "anatomies") for volume in volumes) if folder.exists()]
 
 
-def _drive(run: _Run, anatomy: Path) -> None:
+def _navigate(run: _Run, anatomy: Path, target: str) -> dict[str, Any]:
     assert run.navigation is not None
-    tree = read_anatomy(anatomy).tree
-    longest = tree.longest_leaf()
-    target = tree.section_names[tree.branches[longest].section[-1]]
     settings = NavigateConfig(seed=run.config.seed)
-    navigate_into(anatomy, target, output=run.navigation, device=run.config.device, config=settings)
+    return navigate_into(anatomy, target, output=run.navigation, device=run.config.device, config=settings)
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
-    _learn(run, anatomies)
-    run.stages.do("report", lambda: _report(run, [folder.name for folder in anatomies]))
-    return _finish(run)
-
-
-def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
-    """Simulate navigations, train networks on them or take simulated wires, and evaluate the model."""
+    """Simulate navigations, train networks on them or take simulated wires, evaluate the model, and report."""
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
@@ -317,23 +315,26 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
         report_evaluation(output / "evaluation")
 
     run.stages.do("evaluation", measure)
+    run.stages.do("report", lambda: _report(run, anatomies))
+    return _finish(run)
 
 
-def _report(run: _Run, names: Sequence[str]) -> None:
+def _report(run: _Run, anatomies: Sequence[Path]) -> None:
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output
     anatomy, replay = _replay(output)
-    scores = _scores(output, names)
+    scores = _scores(anatomies)
+    write_json(output / "scores.json", scores)
     patients = tuple(
         PatientContent(
-            name=name,
-            anatomy=output / "anatomies" / name,
-            volume=output / "ct" / f"{name}{VOLUME_SUFFIX}",
-            mask=output / "masks" / f"{name}{VOLUME_SUFFIX}",
-            scores=scores.get(name, {}),
+            name=folder.name,
+            anatomy=folder,
+            volume=_beside(folder, "ct", VOLUME_SUFFIX),
+            mask=_beside(folder, "masks", VOLUME_SUFFIX),
+            scores=scores.get(folder.name, {}),
         )
-        for name in names
+        for folder in anatomies
     )
     content = ReportContent(
         title="endopilot: from a CT angiogram to guidewire control",
@@ -352,19 +353,14 @@ def _report(run: _Run, names: Sequence[str]) -> None:
         print(remark, file=sys.stderr)
 
 
-def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    path = output / "scores.json"
-    if path.exists():
-        return read_json(path)
-    scores = {}
-    known = [name for name in names if (output / "truth" / name).exists()]
+def _scores(anatomies: Sequence[Path]) -> dict[str, dict[str, float]]:
+    """Return the scores of those anatomies whose truth is known."""
+    scores, known = {}, [folder for folder in anatomies if _beside(folder, "truth").exists()]
     with progress("Comparing with the truth", len(known)) as advance:
-        for name in known:
-            mask = read_mask(output / "masks" / f"{name}{VOLUME_SUFFIX}")
-            extracted, truth = (read_anatomy(output / folder / name) for folder in ("anatomies", "truth"))
-            scores[name] = asdict(score_anatomy(mask, extracted, truth))
+        for folder in known:
+            mask, truth = read_mask(_beside(folder, "masks", VOLUME_SUFFIX)), read_anatomy(_beside(folder, "truth"))
+            scores[folder.name] = asdict(score_anatomy(mask, read_anatomy(folder), truth))
             advance()
-    write_json(path, scores)
     return scores
 
 
@@ -383,13 +379,8 @@ def _finish(run: _Run) -> dict[str, Any]:
     wall_seconds = sum(stages.seconds.values())
     if not (output / "manifest.json").exists():
         write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
-        facts = {
-            "wall_seconds": wall_seconds,
-            "stages": stages.seconds,
-            "rejected": stages.rejected,
-            "notes": run.notes,
-        }
-        record = manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, **facts)
+        facts = {"wall_seconds": wall_seconds, "stages": stages.seconds, "rejected": stages.rejected}
+        record = manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, **facts, notes=run.notes)
         write_json(output / "manifest.json", record)
     return {
         "report": str(output / REPORT_FILE),

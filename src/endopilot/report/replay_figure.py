@@ -37,7 +37,7 @@ def _draw_plane(axes: Axes, anatomy: Anatomy, episode: EpisodeReplay) -> None:
     across, up = anatomy.tree.widest_axes()
     anatomy.plot(axes=axes, color="#dfe3e8")
     axes.plot(episode.seen[:, across], episode.seen[:, up], ".", color=BLACK, ms=3)
-    given, rest = episode.simulated[episode.given], episode.simulated[~episode.given]
+    given, rest = episode.simulated[episode.given], episode.predicted[~episode.given]
     axes.plot(given[:, across], given[:, up], color=ORANGE, lw=1.3)
     axes.plot(rest[:, across], rest[:, up], color=VERMILLION, lw=1.3)
     both = np.concatenate([episode.seen, episode.simulated])[:, [across, up]]

@@ -276,7 +276,7 @@ def _wire_costs(
 
 def _cost(episode: EpisodeReplay, robot: RobotConfig) -> float:
     """Return what a wire costs in an episode: errors of the tip, and of the drive's force where it was measured."""
-    tip = float(np.minimum(np.linalg.norm(episode.in_view, axis=1), FAR_MM).mean()) / _TYPICAL_MM
+    tip = float(np.minimum(episode.core_mm, FAR_MM).mean()) / _TYPICAL_MM
     if not len(episode.force):
         return tip
     error = np.diff(episode.force, axis=1) / max(3 * robot.wire.load_sd_n, 1e-3)

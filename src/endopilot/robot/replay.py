@@ -2,7 +2,8 @@
 
 Nobody logs how deep the wire lies when an episode begins, or to which side its tip is bent. Both are taken from what
 was seen in the given first part of the episode: of worlds whose wires are turned by equal angles, the one whose tip
-comes nearest to the real one there. What follows is predicted from the commands alone.
+comes nearest to the real one there. What follows is predicted from the commands alone: kinematics lead the tip along
+the branch that the core takes, and the tip is expected beside it by what tips before were.
 """
 
 from __future__ import annotations
@@ -13,14 +14,16 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.lines import places_on
 from endopilot.robot.candidates import LEAST_EPISODES, UNKNOWN_SHARE, Candidates
-from endopilot.robot.kinematics import Tracks, filtered, led
+from endopilot.robot.kinematics import Tracks, evenly, filtered, led
 from endopilot.robot.log import Courses, RobotLog
 from endopilot.settings import OpenShare, Within, public, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
@@ -39,9 +42,12 @@ _KEEPS_RAD, _TELLS_MM = 0.2, 0.2
 _FADES = 0.08
 """Share of what is given over which a tip's weight falls by 1/e, when a world is chosen: of the public logs' passages
 .76 take the real branch with .03 to .1, .74 with .15, .64 with 1."""
-_SIDE_MM = 10.0
-"""Travel over which what a simulated tip was off by falls by 1/e, mm: in the plane .51 mm of error become .47 in the
-public logs, with 3 mm .48, with 40 mm .50."""
+_BESIDE = (0.2, 1.5, 0.3, 10.0, 0.1)
+"""How far tips are beside where they are led, mm: deviation of a map of the vessel, and length over which it is alike;
+deviation of what an episode adds, and travel over which 1/e of it is left; noise. Likeliest for six public logs; in the
+plane .44 mm of the core's error become .28 there, and the best of core and kinematics errs by .37."""
+_OWN, _EARLIER = 50, 200
+"""Tips that tell it at most, of the episode and of the log's episodes before, evenly chosen for time."""
 _TOGETHER = 8
 """Episodes that are simulated side by side, for as long as the longest of them takes."""
 _TRAVEL_MM = 1000.0
@@ -69,14 +75,15 @@ class EpisodeReplay:
         time_s: at which the tip was seen, by the log's clock, s.
         given: which of the tips say where the wire lies; the others were predicted.
         seen: the real tip, LPS mm.
-        simulated: the simulated tip at the same times, LPS mm; what it was off by at the last given tip, as the camera
-            sees it, is taken off, and fades as the wire slides.
+        simulated: the simulated tip at the same times, LPS mm.
+        predicted: where the tip is expected, LPS mm: beside where kinematics lead it in the simulated tip's branch, or
+            beside the simulated tip, by what tips before were; as simulated while given.
         abscissa: Δtip of both, seen and simulated, mm.
         driven: Δtip without the vessel: what lag, gain and play make of the commands, from the last given tip, mm.
-        in_view: the difference of both tips, as the camera sees it, mm.
+        in_view: the difference of the predicted tip from the real one, as the camera sees it, mm.
+        core_mm: distance of the simulated tip from the real one, likewise.
         along: unit vector along the vessel at the real tip.
         branch: of both tips.
-        sure: share of the worlds, by how likely each is, whose tip is in the simulated tip's branch.
         force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
         rotation_rad: φ that the simulated wire began with.
         rotation_known_rad: rotations no farther from it than this are as good, as what was given tells; NaN where it
@@ -88,12 +95,13 @@ class EpisodeReplay:
     given: Bool[np.ndarray, "tips"]
     seen: Float[np.ndarray, "tips 3"]
     simulated: Float[np.ndarray, "tips 3"]
+    predicted: Float[np.ndarray, "tips 3"]
     abscissa: Float[np.ndarray, "tips 2"]
     driven: Float[np.ndarray, "tips"]
     in_view: Float[np.ndarray, "tips 3"]
+    core_mm: Float[np.ndarray, "tips"]
     along: Float[np.ndarray, "tips 3"]
     branch: Float[np.ndarray, "tips 2"]
-    sure: Float[np.ndarray, "tips"]
     force: Float[np.ndarray, "readings 2"]
     rotation_rad: float
     rotation_known_rad: float
@@ -218,11 +226,60 @@ def replay_prepared(
     apart = tracks.abscissa - tried.abscissa[rows, first]
     depth = seen.offset + filtered(apart, tracks.travel(robot.latency_s), noise).offset
     best = _simulated(of, device, times, course, depth, angles[rows, first][:, None], simulator)
-    sure = np.einsum("ew,ewt->et", likely, tried.branch == best.branch)
+    expected = _expected(of, best, driven)
     return [
-        _episode(of, k, best, sure[k], driven[k], (float(angles[k, first[k]]), known[k]), times[k, 1:])
-        for k in range(len(rows))
+        _episode(of, k, best, expected[k], driven[k], (float(angles[k, first[k]]), known[k]), times[k, 1:])
+        for k in rows.tolist()
     ]
+
+
+def _expected(of: Prepared, best: _Tried, driven: Float[np.ndarray, "episodes tips"]) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return where tips are expected: beside where kinematics lead them in the core's branch, or beside the core's tip,
+    whichever was nearer to tips before.
+
+    By how much is a Gaussian process (Rasmussen & Williams 2006, chapter 2): a map of the vessel, which the log's
+    episodes before tell too, and what an episode adds, which is forgotten as the wire slides.
+    """
+    found, name, nothing = [], "", np.empty((0, 8))
+    before = [nothing, nothing]
+    for k, log in enumerate(of.logs):
+        if log.name != name:
+            before, name = [nothing, nothing], log.name
+        count = int(of.courses.seen[k].sum())
+        given, led_mm, branch = of.given[k, :count], driven[k, :count], of.branch[k, :count]
+        since = [np.cumsum(np.abs(np.diff(led_mm, prepend=led_mm[0]))), np.full(count, k)]
+        core, taken = best.tip[k, 0, :count], best.branch[k, 0, :count]
+        lines = _on_lines(of, led_mm, branch), _on_lines(of, led_mm, np.where(given, branch, taken))
+        tried = []
+        for j, (real, led_to) in enumerate((lines, (core, core))):
+            rows = np.column_stack([real, *since, -_in_view(log, real)])
+            own, earlier = rows[given], before[j]
+            known = np.concatenate([own[evenly(len(own), _OWN)], earlier[evenly(len(earlier), _EARLIER)]])
+            before[j] = np.concatenate([earlier, rows[(branch == taken) | (j == 0)]])
+            weights = np.linalg.solve(_alike(known, known) + _BESIDE[-1] ** 2 * np.eye(len(known)), known[:, 5:])
+            beside = _alike(np.column_stack([led_to, *since]), known) @ weights
+            tried.append((np.linalg.norm(known[:, 5:], axis=1).mean(), led_to + beside))
+        found.append(min(tried, key=lambda one: one[0])[1])
+    return found
+
+
+def _alike(tips: Float[np.ndarray, "n columns"], known: Float[np.ndarray, "m more"]) -> Float[np.ndarray, "n m"]:
+    """Return the covariance, mm², of what tips are beside; columns are place, travel, mm, and episode."""
+    map_mm, length_mm, episode_mm, travel_mm, _ = _BESIDE
+    near = map_mm**2 * np.exp(-cdist(tips[:, :3], known[:, :3], "sqeuclidean") / (2 * length_mm**2))
+    since = np.abs(tips[:, None, 3] - known[:, 3]) / travel_mm
+    return near + episode_mm**2 * (tips[:, None, 4] == known[:, 4]) * np.exp(-since)
+
+
+def _on_lines(
+    of: Prepared, abscissa: Float[np.ndarray, "tips"], branch: Float[np.ndarray, "tips"]
+) -> Float[np.ndarray, "tips 3"]:
+    """Return the points at abscissas on the lines to some branches."""
+    found = np.empty((len(branch), 3))
+    for one in np.unique(branch):
+        line, here = of.anatomy.tree.path(int(one)), branch == one
+        found[here] = places_on(line.points, line.abscissa, abscissa[here])
+    return found
 
 
 def _proximal(
@@ -365,7 +422,7 @@ def _episode(
     of: Prepared,
     k: int,
     best: _Tried,
-    sure: Float[np.ndarray, "tips"],
+    expected: Float[np.ndarray, "seen 3"],
     driven: Float[np.ndarray, "tips"],
     rotation: tuple[float, float],
     ends: Float[np.ndarray, "periods"],
@@ -376,10 +433,7 @@ def _episode(
     simulated = best.force[k, 0]
     measured = np.isfinite(log.load[:, 0, 0]) & (log.time_s >= log.time_s[log.seen][0])
     tip, given = best.tip[k, 0, :count], of.given[k, :count]
-    travel = np.cumsum(np.abs(np.diff(driven[:count], prepend=driven[0])))
-    last = int(given.sum()) - 1
-    fades = np.where(given, 0.0, np.exp((travel[last] - travel) / _SIDE_MM))
-    tip = tip - fades[:, None] * _in_view(log, tip)[last]
+    predicted = np.where(given[:, None], tip, expected)
     pushed = np.interp(
         log.time_s[measured] - log.time_s[0], ends[np.isfinite(simulated)], simulated[np.isfinite(simulated)]
     )
@@ -389,12 +443,13 @@ def _episode(
         given=given,
         seen=log.tip[log.seen],
         simulated=tip,
+        predicted=predicted,
         abscissa=np.column_stack([of.abscissa[k, :count], best.abscissa[k, 0, :count]]),
         driven=driven[:count],
-        in_view=_in_view(log, tip),
+        in_view=_in_view(log, predicted),
+        core_mm=np.linalg.norm(_in_view(log, tip), axis=1),
         along=tangents(line.points)[nearest],
         branch=np.column_stack([of.branch[k, :count], best.branch[k, 0, :count]]),
-        sure=sure[:count],
         force=np.column_stack([log.load[measured, 0, 0], pushed]),
         rotation_rad=rotation[0],
         rotation_known_rad=rotation[1],

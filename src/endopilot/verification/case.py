@@ -106,38 +106,18 @@ def straight_rod(
     return uniform_rod(
         elements + clamp,
         length_mm / (elements - 0.5),
-        bend=bend,
-        twist=twist,
-        shear=stiff if shear is None else shear,
-        stretch=stiff if stretch is None else stretch,
+        bend_n_mm2=bend,
+        twist_n_mm2=twist,
+        shear_n=stiff if shear is None else shear,
+        stretch_n=stiff if stretch is None else stretch,
         radius_mm=radius_mm,
-        drag=drag,
-        spin_drag=drag,
+        drag_n_s_mm=drag,
+        spin_drag_n_mm_s=drag,
     )
 
 
-def uniform_rod(
-    nodes: int,
-    size_mm: float,
-    *,
-    bend: float,
-    twist: float,
-    shear: float,
-    stretch: float,
-    radius_mm: float,
-    drag: float,
-    spin_drag: float,
-) -> RodLayout:
-    """Return a straight rod with the same section throughout: see `straight_rod`; elements are `size_mm` long."""
-    section = {
-        "shear_n": shear,
-        "stretch_n": stretch,
-        "bend_n_mm2": bend,
-        "twist_n_mm2": twist,
-        "radius_mm": radius_mm,
-        "drag_n_s_mm": drag,
-        "spin_drag_n_mm_s": spin_drag,
-    }
+def uniform_rod(nodes: int, size_mm: float, **section: float) -> RodLayout:
+    """Return a straight rod whose section, by the fields of `RodLayout`, is the same throughout."""
     throughout = {name: np.full(nodes, value) for name, value in section.items()}
     return RodLayout(abscissa_mm=size_mm * np.arange(nodes), rest_curvature=np.zeros((nodes, 3)), **throughout)
 
@@ -161,14 +141,7 @@ class Loading:
 
     def core(self) -> _core.Loads:
         """Return the loads as the core wants them."""
-        return _core.make_loads(
-            force=self.force_n,
-            moment=self.moment_n_mm,
-            spring=self.spring_n_mm,
-            anchor=self.anchor_mm,
-            hold=self.hold_n_mm,
-            attitude=self.attitude,
-        )
+        return _core.make_loads(**{name.partition("_")[0]: value for name, value in vars(self).items()})
 
 
 def equilibrium(
@@ -177,28 +150,17 @@ def equilibrium(
     *,
     samples: int = 2,
     control: Float[np.ndarray, "samples 2"] | None = None,
-    lumen: _core.Lumen | None = None,
-    friction: float = 0.0,
     config: SimulatorConfig = STATIC,
-    insertion: Insertion = X_AXIS,
     inserted_length_mm: float | None = None,
-    free_behind_mm: float = 0.0,
+    **scene: Any,
 ) -> dict[str, np.ndarray]:
-    """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
+    """Bring one clamped rod to rest, as `driven` does, and return the core's arrays without the world axis.
     All nodes but the last three are free; `control` moves the clamp, mm/s and rad/s."""
     if inserted_length_mm is None:
         inserted_length_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
-    return driven(
-        rod,
-        np.zeros((samples, 2)) if control is None else control,
-        initial=np.array([inserted_length_mm, 0.0]),
-        loading=loading,
-        lumen=lumen,
-        friction=friction,
-        config=replace(config, sample_tolerance_mm=1e-8),
-        insertion=insertion,
-        free_behind_mm=free_behind_mm,
-    )
+    control = np.zeros((samples, 2)) if control is None else control
+    config, initial = replace(config, sample_tolerance_mm=1e-8), np.array([inserted_length_mm, 0.0])
+    return driven(rod, control, initial=initial, loading=loading, config=config, **scene)
 
 
 def driven(

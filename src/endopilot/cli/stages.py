@@ -1,14 +1,27 @@
-"""`endopilot run`: one CT angiogram -> everything up to the report, and a wire driven to a target."""
+"""`endopilot demo` and `run`: every stage in a row, of synthetic patients or of one CT angiogram."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import Existing, Figures, OutputFolder
-from endopilot.pipeline.study import RunConfig, run_volume
+from endopilot.pipeline.study import DemoConfig, RunConfig, run_demo, run_volume
 
 
-def command(
+def demo_command(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = DemoConfig()) -> Figures:
+    """Run every stage once on synthetic patients: CT angiogram, segmentation, anatomy, simulation, training, report.
+
+    An interrupted demo goes on where it stopped when the same command is given again.
+
+    Args:
+        output: folder of all results; the report is report.html.
+    """
+    return run_demo(output, config)
+
+
+def run_command(
     volume: Positional[Existing],
     /,
     *,

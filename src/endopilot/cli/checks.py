@@ -1,8 +1,8 @@
-"""`endopilot devices`: the known guidewires and their properties."""
+"""`endopilot verify`, `devices` and `sample`: the core against closed forms, the known wires, a CT to try."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
@@ -11,10 +11,25 @@ from endopilot.devices.catheter import catheter_yaml, list_catheters
 from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_wires, user_devices
 from endopilot.errors import InputError
+from endopilot.imaging.sample import fetch_sample
 from endopilot.simulation.tip_load import tip_load_row
+from endopilot.verification import free_rod
+from endopilot.verification.case import run
 
 
-def command(
+def verify_command() -> Answer:
+    """Compare the rod core with closed forms of free rods; print one row a case and its verdict.
+
+    A row holds case, reference, value, error and bar. The exit code is 1 if an error exceeds its bar. In the source
+    tree, `python -m benchmarks verification` also compares drives, walls, friction, catheters, moving vessels and an
+    independent engine, and `python -m benchmarks --help` lists what else is measured.
+    """
+    rows = [case.row() for case in run(free_rod.CASES)]
+    more = "more: `python -m benchmarks verification` in the source tree (drives, walls, catheters, MuJoCo)"
+    return Answer(rows, [rows, more], passed=all(row["passed"] is not False for row in rows))
+
+
+def devices_command(
     devices: Positional[tuple[str, ...]] = (), /, *, tip_load: bool = False, yaml: bool = False
 ) -> Answer | None:
     """List devices: diameter, bending stiffness EI and torsional stiffness GJ at tip and shaft, tip load, tip shape.
@@ -49,3 +64,12 @@ def _yaml(name: str) -> str:
 def _row(name: str) -> dict[str, Any]:
     path = device_file(name)
     return read_wire(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}
+
+
+def sample_command(name: Positional[Literal["cta-thorax"]] = "cta-thorax", /) -> None:
+    """Download a real thoracic CT angiogram, check it, and print its path, licence and source.
+
+    Args:
+        name: which sample.
+    """
+    print(fetch_sample(name))
