@@ -54,9 +54,9 @@ def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Trajec
         data = episodes.select(episodes.anatomy == name)
         anatomy, device = episodes.setup.anatomies[str(name)](), episodes.setup.device
         rollouts.append(
-            simulate(anatomy, device, data.command, initial=data.initial, config=replace(config, threads=1))
+            simulate(anatomy, device, data.command, initial=data.start, config=replace(config, threads=1))
         )
-    return rollouts, 0.5 * episodes.branch.size / (time.process_time() - start)
+    return rollouts, 0.5 * episodes.tip[..., 0].size / (time.process_time() - start)
 
 
 def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConfig) -> list[str]:

@@ -29,7 +29,6 @@ def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     np.testing.assert_array_equal(episodes.proximal[..., 1], dataset.rotation[:, :, 0])
     np.testing.assert_array_equal(episodes.tip[..., 0], dataset.tip_abscissa[:, :, 0])
     np.testing.assert_array_equal(episodes.tip[..., 1], dataset.tip_offset[:, :, 0])
-    np.testing.assert_array_equal(episodes.initial, dataset.initial[:, 0])
     np.testing.assert_array_equal(episodes.command, slipped.command)
     np.testing.assert_array_equal(episodes.start, dataset.initial)
     assert np.abs(episodes.command[:, :, 0] - episodes.control).max() > 1.0
@@ -42,16 +41,7 @@ def test_chosen_episodes_share_the_setup(dataset):
     episodes = Episodes.of_dataset(dataset)
     some = episodes.select(np.array([3, 1]))
     assert some.setup is episodes.setup and some.anatomy.tolist() == [episodes.anatomy[3], episodes.anatomy[1]]
-    np.testing.assert_array_equal(some.branch, episodes.branch[[3, 1]])
-
-
-def test_episodes_from_a_sample_on_begin_at_the_state_before_it(dataset):
-    episodes = Episodes.of_dataset(dataset)
-    later = episodes.from_sample(40)
-    np.testing.assert_array_equal(later.initial, episodes.proximal[:, 39])
-    for name in ("control", "command", "proximal", "tip", "branch", "tip_sd"):
-        np.testing.assert_array_equal(getattr(later, name), getattr(episodes, name)[:, 40:])
-    assert episodes.from_sample(0) is episodes
+    np.testing.assert_array_equal(some.tip, episodes.tip[[3, 1]])
 
 
 def test_planned_controls_are_made_exactly(fork, wire):

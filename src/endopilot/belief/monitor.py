@@ -171,6 +171,11 @@ class Monitor:
             self._innovations = self._watch.innovations
 
     @property
+    def predicted(self) -> Predicted:
+        """What the belief predicts of the tip."""
+        return predicted_tip(self.belief)
+
+    @property
     def lost(self) -> bool:
         """Whether no wire explains what X-ray showed last."""
         return self.states.lost
