@@ -52,10 +52,8 @@ def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Trajec
     rollouts, start = [], time.process_time()
     for name in np.unique(episodes.anatomy):
         data = episodes.select(episodes.anatomy == name)
-        anatomy, device = episodes.setup.anatomies[str(name)](), episodes.setup.device
-        rollouts.append(
-            simulate(anatomy, device, data.command, initial=data.start, config=replace(config, threads=1))
-        )
+        anatomy, device = episodes.anatomies[str(name)](), episodes.device
+        rollouts.append(simulate(anatomy, device, data.command, initial=data.start, config=replace(config, threads=1)))
     return rollouts, 0.5 * episodes.tip[..., 0].size / (time.process_time() - start)
 
 
@@ -69,7 +67,7 @@ def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConf
 
 
 def _held(episodes: Episodes, rollouts: list[Trajectory]) -> str:
-    limit = HELD * episodes.setup.device.pull_limit_n
+    limit = HELD * episodes.device.pull_limit_n
     return f"{100 * np.mean(np.concatenate([(r.base_force < -limit).ravel() for r in rollouts])):.2f} %"
 
 

@@ -28,7 +28,7 @@ from endopilot.files import write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import OpenLoop
 from endopilot.simulation.world import World
-from toy_navigation import make_toy_dataset, toy_run
+from toy_navigation import make_toy_dataset
 
 CONFIG = AdviseConfig(adviser=AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8))
 SHAPE = {"patients": 12, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
@@ -71,14 +71,13 @@ def folder(tmp_path_factory) -> Path:
     """Return a folder with a dataset of twelve toy patients, ten of which calibrate, and a run."""
     folder = tmp_path_factory.mktemp("advice")
     make_toy_dataset(folder / "dataset", **SHAPE, anatomy_shares=SHARES)
-    record = {"config": {}, "networks": {}, "device": asdict(read_wire("workhorse-014"))}
+    record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("workhorse-014"))}
     write_json(folder / "run" / "manifest.json", record)
     return folder
 
 
 @pytest.fixture(autouse=True)
-def toy_core(monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.dataset.loader.run_set_up", toy_run)
+def hold_slack(monkeypatch) -> None:
     monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda run: HoldSlack())
 
 
@@ -235,16 +234,15 @@ def test_too_few_patients_another_wire_or_no_run_leave_nothing_behind(folder, tm
         advise(folder / "run", folder / "dataset", out, config)
     with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
         advise(tmp_path / "no-run", folder / "dataset", out, AdviseConfig())
-    record = {"config": {}, "networks": {}, "device": asdict(read_wire("j-035"))}
+    record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("j-035"))}
     write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
         advise(tmp_path, folder / "dataset", out, AdviseConfig())
     assert not out.exists() and not (tmp_path / "xray.json").exists()
 
 
-def test_simulated_wires_are_followed_by_the_belief_of_the_agent(fork, tmp_path, monkeypatch) -> None:
+def test_simulated_wires_are_followed_by_the_belief_of_the_agent(fork, tmp_path) -> None:
     """A deeper ostium is identified from the first 15 s, and the tip then known without X-ray."""
-    monkeypatch.undo()
     wire = read_wire("workhorse-014")
     config = DatasetConfig(sequences=1, seconds=18.0, seed=3)
     write_anatomy(fork, output=tmp_path / "fork")

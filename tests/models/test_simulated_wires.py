@@ -65,7 +65,7 @@ def test_identified_from_the_given_tips_they_predict_the_others(episodes):
 
 def test_in_a_patient_who_moves_wires_move_as_far_as_is_known(patient, tmp_path):
     moving = navigations(patient, tmp_path / "moving", sequences=2, seed=4, motion="both")
-    blind = replace(moving, setup=replace(moving.setup, known_motions={}))
+    blind = replace(moving, known_motions={})
     fitted, unaware = (error_mm(SimulatedWires().rollout_forward(each).tip, moving).mean() for each in (moving, blind))
     assert fitted < 0.5 * unaware, (fitted, unaware)
 

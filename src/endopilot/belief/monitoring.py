@@ -108,7 +108,7 @@ class Followed:
 
 
 class Patient:
-    """A patient's recorded navigations, simulated again, and the C-arm that shows them.
+    """A patient's recorded navigations, and the C-arm that shows them.
 
     Attributes:
         name: the patient's.
@@ -138,10 +138,10 @@ class Patient:
         self._beside_mm, known = np.array(world.registration_mm), self._arm.known_motion
         ostium = np.asarray(anatomy.insertion.position)
         self._moves = seen_in_episodes(motion, known, ostium, data.valid.shape[1], SAMPLE_PERIOD_S)
-        self._tree = anatomy.tree
-        self._true = data.driven(anatomy=anatomy, record_shape=config.xray == "images")
+        self._tree, self._true = anatomy.tree, data
+        self._shape = data.driven(anatomy=anatomy, record_shape=True).shape if config.xray == "images" else None
         deeper_mm = world.ostium_mm + config.ostium_mm * float(self._random(4).uniform(-1.0, 1.0))
-        self._encoders = self._true.proximal[:, :, 0] - np.array([deeper_mm, 0.0])
+        self._encoders = np.stack([data.inserted_length, data.rotation], axis=-1)[:, :, 0] - [deeper_mm, 0.0]
         self.navigations = [
             replace(
                 given,
@@ -149,7 +149,7 @@ class Patient:
                 start_rotation_rad=turn,
                 known_motion=known,
             )
-            for length, turn in self._true.start[:, 0].tolist()
+            for length, turn in data.initial[:, 0].tolist()
         ]
 
     def _random(self, *purpose: int) -> np.random.Generator:
@@ -163,9 +163,9 @@ class Patient:
             return points + self._beside_mm if moves is None else place(moves[sample], points + self._beside_mm)
 
         length, random = float(self._encoders[number, sample, 0]), self._random(3, self._sequence[number], sample)
-        if true.shape is not None:
-            return self._arm.measure(seen(true.shape[at]), length, random)
-        tip, heading = true.tip_position[at][0], true.tip_direction[at][0]
+        if self._shape is not None:
+            return self._arm.measure(seen(self._shape[at]), length, random)
+        tip, heading = (each[at][0].astype(float) for each in (true.tip_position, true.tip_direction))
         return self._arm.measure(
             seen(tip), heading if moves is None else turned(moves[sample], heading), length, random
         )
@@ -183,13 +183,15 @@ class Patient:
             spread.append(follower.predicted.spread)
             exposures.append((on, seen is not None))
             on = sample + 1 < WINDOW or (asked and bool(believed[-1].asks)) or (on and seen is None)
-        tip, (exposed, shown) = true.tip[number, :, 0], np.array(exposures).T
+        exposed, shown = np.array(exposures).T
         branch, predicted = zip(*((each.branch, (each.abscissa, each.offset)) for each in believed), strict=True)
-        where = np.array(predicted)
-        off = astray_mm(self._tree, (np.array(branch), where[:, 0]), (tip.branch, tip.abscissa))
-        ratio = safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm)
+        where, of_wire = np.array(predicted), (number, slice(None), 0)
+        abscissa, offset, radius = (
+            each[of_wire].astype(float) for each in (true.tip_abscissa, true.tip_offset, true.lumen_radius)
+        )
+        off = astray_mm(self._tree, (np.array(branch), where[:, 0]), (true.branch[of_wire], abscissa))
         states = {
-            "wall": ratio >= advice.wall_ratio,
+            "wall": safety_ratio(offset, radius, navigation.device.tip_radius_mm) >= advice.wall_ratio,
             "astray": off >= advice.abscissa_mm,
             "force": ~is_safe(true.contact_force_max[number], navigation.force_limit_n),
         }
@@ -197,7 +199,7 @@ class Patient:
         return Followed(
             patient=self.name,
             length_mm=self._encoders[number, rows, 0],
-            true=np.stack([tip.abscissa, tip.offset], axis=-1)[rows],
+            true=np.stack([abscissa, offset], axis=-1)[rows],
             predicted=where[rows],
             spread=np.array(spread)[rows],
             half_width=np.array([each.half_width for each in believed])[rows],
@@ -339,10 +341,11 @@ def coverage(found: Sequence[Followed]) -> dict[str, Any]:
         whole += [inside[off & (interval == number)].all(axis=0) for number in numbers]
         owner += [each.patient] * len(numbers)
         held.append(inside[off])
-    both = np.array(whole)
-    patients = np.sort([both.all(axis=1)[np.array(owner) == name].mean() for name in set(owner)])
+    both, of = np.array(whole), np.array(owner)
+    throughout = np.asarray(both.all(axis=1))
+    patients = np.sort(np.array([throughout[of == name].mean() for name in set(owner)]))
     return {
-        "simultaneous": float(both.all(axis=1).mean()),
+        "simultaneous": float(throughout.mean()),
         "each_band": both.mean(axis=0).tolist(),
         "worst_decile_of_patients": float(patients[: max(1, round(len(patients) / 10))].mean()),
         "samplewise": float(np.concatenate(held).all(axis=1).mean()),

@@ -10,8 +10,7 @@ from endopilot.belief.monitor import BelievedTip
 from endopilot.belief.watch import Watch
 from endopilot.devices.stack import Proximals
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, EpisodeSetUp, Predictor
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.models.episodes import Episodes, Predictor
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -28,8 +27,7 @@ class NetworkMonitor:
         self, predictor: Predictor, navigation: Navigation, calibration: Calibration | None, advice: AdviserConfig
     ) -> None:
         """Begin a navigation; without a calibration nothing is asked for."""
-        self._predictor, self._tree = predictor, navigation.anatomy.tree
-        self._set_up = EpisodeSetUp.of_anatomy(navigation.anatomy, navigation.device, SimulatorConfig())
+        self._predictor, self._navigation = predictor, navigation
         self._proximal, self._tips, self._branch = list[np.ndarray](), list[np.ndarray](), 0
         start = navigation.start[0]
         self.predicted = self._at(start, np.array([start[0], 0.0]))
@@ -61,14 +59,15 @@ class NetworkMonitor:
         return BelievedTip(abscissa, offset, (along, across), asks, branch=self._branch)
 
     def _at(self, proximal: np.ndarray, tip: np.ndarray) -> Predicted:
-        line = self._tree.path(self._branch)
+        line = self._navigation.anatomy.tree.path(self._branch)
         return Predicted(proximal, tip, np.zeros(2), float(np.interp(tip[0], line.abscissa, line.radius)))
 
     def _rolled(self) -> np.ndarray:
         """Return the tip that follows from the last `WINDOW` states and the motion since."""
         proximal, tips = np.array(self._proximal[-WINDOW - 2 :]), np.array(self._tips[-WINDOW:])
         made = Episodes.of_controls(
-            self._set_up,
+            self._navigation.anatomy,
+            self._navigation.device,
             initial=proximal[0],
             control=np.diff(proximal, axis=0)[None] / DECISION_PERIOD_S,
             tip=np.concatenate([tips, tips[-1:]])[None],

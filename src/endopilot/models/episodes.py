@@ -7,7 +7,7 @@ A dataset gives them by `Episodes.of_dataset`, a plan or a navigation under way 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -30,53 +30,6 @@ AnyNetwork = TypeVar("AnyNetwork")
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeSetUp:
-    """What episodes have in common: the vessels that they may lie in, and the devices.
-
-    Attributes:
-        anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
-        device: the wire, or the wire in its catheters, as they are given.
-        simulator: settings of the rod core.
-        known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
-            not there, or None, lie still.
-    """
-
-    anatomies: Mapping[str, Callable[[], Anatomy]]
-    device: Wire | Stack
-    simulator: SimulatorConfig
-    known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
-
-    @staticmethod
-    def of_anatomy(anatomy: Anatomy, device: Wire | Stack, simulator: SimulatorConfig) -> EpisodeSetUp:
-        """Return the setup of navigations in one vessel that is in memory."""
-        return EpisodeSetUp({anatomy.name: lambda: anatomy}, device, simulator)
-
-    @staticmethod
-    def of_dataset(dataset: Dataset) -> EpisodeSetUp:
-        """Return the setup of a dataset.
-
-        Of patients who move the published mean is known, with the phase of heart and breath.
-        """
-
-        def read(name: str) -> Anatomy:
-            return read_anatomy(dataset.anatomy_folder(name))
-
-        with reading(dataset.folder, "make the dataset again"):
-            device = dataset.stack
-            simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-        return EpisodeSetUp(
-            anatomies={name: partial(read, name) for name in dataset.patients},
-            device=device,
-            simulator=simulator,
-            known_motions={
-                name: published_mean(motion)
-                for name in dataset.patients
-                if (motion := dataset.motion(name)) is not None
-            },
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class Episodes:
     """Navigations of equal length as a predictor is given them. Sample t is the state at the end of period t.
 
@@ -84,7 +37,11 @@ class Episodes:
     hold anything there, such as the tip that is desired.
 
     Attributes:
-        setup: the vessels and the wire.
+        anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
+        device: the wire, or the wire in its catheters, as they are given.
+        simulator: settings of the rod core.
+        known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
+            not there, or None, lie still.
         anatomy: name of each episode's anatomy.
         start: (Δ mm, φ rad) of the wire and its catheters before the first period.
         control: π = (mm/s, rad/s) that the wire's drive made, the mean over each period.
@@ -93,7 +50,10 @@ class Episodes:
         tip: (Δtip, γtip), mm.
     """
 
-    setup: EpisodeSetUp
+    anatomies: Mapping[str, Callable[[], Anatomy]]
+    device: Wire | Stack
+    simulator: SimulatorConfig
+    known_motions: Mapping[str, Motion | None]
     anatomy: Shaped[np.ndarray, "episodes"]
     start: Float[np.ndarray, "episodes devices 2"]
     control: Float[np.ndarray, "episodes samples 2"]
@@ -103,7 +63,8 @@ class Episodes:
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> Episodes:
-        """Return the navigations of a dataset, with their true tips.
+        """Return the navigations of a dataset, with their true tips. Of patients who move the published mean is known,
+        with the phase of heart and breath.
 
         Raises:
             InputError: they are no longer than the states that a predictor is given.
@@ -115,8 +76,14 @@ class Episodes:
                 f"{dataset.folder}: episodes of {samples} samples leave nothing to predict after {WINDOW} given ones; "
                 f"make the dataset with seconds of {seconds:g} or more"
             )
+        with reading(dataset.folder, "make the dataset again"):
+            device, simulator = dataset.stack, SimulatorConfig(**dataset.manifest["config"]["simulator"])
+        motions = {name: dataset.motion(name) for name in dataset.patients}
         return Episodes(
-            setup=EpisodeSetUp.of_dataset(dataset),
+            anatomies={name: partial(_read, dataset, name) for name in dataset.patients},
+            device=device,
+            simulator=simulator,
+            known_motions={name: published_mean(motion) for name, motion in motions.items() if motion is not None},
             anatomy=dataset.anatomy,
             start=dataset.initial,
             control=dataset.control[:, :, 0],
@@ -127,24 +94,28 @@ class Episodes:
 
     @staticmethod
     def of_controls(
-        setup: EpisodeSetUp,
+        anatomy: Anatomy,
+        device: Wire,
         *,
         initial: Float[np.ndarray, "2"],
         control: Float[np.ndarray, "episodes samples 2"],
         tip: Float[np.ndarray, "episodes samples 2"],
     ) -> Episodes:
-        """Return planned navigations in a setup's only vessel; the drive makes exactly what it is commanded.
+        """Return navigations in one vessel whose drive makes exactly what it is commanded.
 
         Args:
-            setup: of one anatomy.
+            anatomy: the vessel.
+            device: the wire.
             initial: (Δ mm, φ rad) before the first period.
             control: π = (mm/s, rad/s).
-            tip: (Δtip, γtip), mm: at rest in the first branch, then as desired or predicted.
+            tip: (Δtip, γtip), mm, as measured, desired or predicted.
         """
-        (name,) = setup.anatomies
         return Episodes(
-            setup=setup,
-            anatomy=np.full(len(control), name),
+            anatomies={anatomy.name: lambda: anatomy},
+            device=device,
+            simulator=SimulatorConfig(threads=1),
+            known_motions={},
+            anatomy=np.full(len(control), anatomy.name),
             start=np.tile(initial, (len(control), 1, 1)),
             control=control,
             command=control[:, :, None].astype(float),
@@ -156,15 +127,14 @@ class Episodes:
         """Return the number of episodes."""
         return len(self.anatomy)
 
-    @property
-    def samples(self) -> int:
-        """Number of samples of each episode."""
-        return self.tip.shape[1]
-
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
         """Return the chosen episodes, given as a mask or as indices."""
-        names = [each.name for each in fields(self) if each.name != "setup"]
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: each[chosen] for name, each in arrays.items() if isinstance(each, np.ndarray)})
+
+
+def _read(dataset: Dataset, name: str) -> Anatomy:
+    return read_anatomy(dataset.anatomy_folder(name))
 
 
 Steps2 = Float[np.ndarray, "episodes steps 2"]
@@ -226,18 +196,11 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
-    """Return the names of the patients of a dataset that a run was trained on.
-
-    A patient is known by the SHA-256 of the anatomy.
+    """Return the names of the patients of a dataset that a run was trained on, by the SHA-256 of their anatomies.
 
     Raises:
-        InputError: the run is too old to name its patients, or the dataset was made with another wire.
+        InputError: the dataset was made with another wire.
     """
     check_wire(run, record, dataset)
-    if "patients" in record:
-        return frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
-    if record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
-        return frozenset(dataset.of_split("train").anatomy.tolist())
-    raise InputError(
-        f"{run}: does not name the patients that it was trained on, as it was made by an older version; train it again"
-    )
+    trained = set(record["patients"])
+    return frozenset(name for name, sha in dataset.patients.items() if sha in trained)

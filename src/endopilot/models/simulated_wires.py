@@ -22,10 +22,11 @@ from endopilot.devices.stack import Stack
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes, OpenLoop, Steps2
 from endopilot.models.hypotheses import (
+    DRIFT,
     HYPOTHESES,
     LUMEN,
     MEDIAN_SQUARE,
-    Displaced,
+    REGISTRATION,
     Family,
     Posterior,
     likelihoods,
@@ -38,7 +39,7 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-FAMILY = Family([each for each in HYPOTHESES if each.name != LUMEN and not isinstance(each, Displaced)])
+FAMILY = Family([each for each in HYPOTHESES if each.name not in (LUMEN, REGISTRATION, DRIFT)])
 """What members differ in; a lumen of their own would need a map of the vessel each, and tips along a vessel show no
 registration."""
 SCALES_MM = np.array([0.05, 0.025])
@@ -78,7 +79,7 @@ class SimulatedWires:
         for chosen, anatomy, data, believed in self._believed(episodes):
             around = [FAMILY.drawn(each.center, each.factor + least, *FOLLOWED) for each in believed]
             members = np.stack([np.concatenate([e.center[None], m]) for e, m in zip(believed, around, strict=True)], 1)
-            paths = _replayed(anatomy, data, members, data.samples)
+            paths = _replayed(anatomy, data, members, data.tip.shape[1])
             weight = weights(paths[:, :, :WINDOW], data.tip[:, :WINDOW].astype(float))
             tip[chosen] = weighted_median(paths[:, :, WINDOW:], weight)
         given = (each[:, WINDOW:].astype(float) for each in (episodes.proximal, episodes.control))
@@ -98,7 +99,7 @@ class SimulatedWires:
         desired = episodes.tip[:, WINDOW:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         for chosen, anatomy, data, believed in self._believed(episodes):
-            best, stack = [FAMILY.world(each.center) for each in believed], Stack.of(data.setup.device)
+            best, stack = [FAMILY.world(each.center) for each in believed], Stack.of(data.device)
             tip[chosen], control[chosen] = track(
                 anatomy,
                 [each.stack(stack) for each in best],
@@ -106,8 +107,8 @@ class SimulatedWires:
                 start=_as_deep(data.start, np.array([each.ostium_mm for each in best])),
                 command=data.command,
                 desired=desired[chosen],
-                config=data.setup.simulator,
-                motion=data.setup.known_motions.get(anatomy.name),
+                config=data.simulator,
+                motion=data.known_motions.get(anatomy.name),
             )
         start = episodes.proximal[:, WINDOW - 1 : WINDOW].astype(float)
         proximal = start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
@@ -120,7 +121,7 @@ class SimulatedWires:
         """Yield the episodes of each anatomy, and what is believed of them after the given states."""
         known = self.identified.setdefault(episodes, {})
         for name in np.unique(episodes.anatomy).tolist():
-            chosen, anatomy = np.flatnonzero(episodes.anatomy == name), episodes.setup.anatomies[name]()
+            chosen, anatomy = np.flatnonzero(episodes.anatomy == name), episodes.anatomies[name]()
             data = episodes.select(chosen)
             if name not in known:
                 known[name] = _identify(anatomy, data)
@@ -148,7 +149,7 @@ def _replayed(
     """Drive every member, given its parameters of `FAMILY`, from the start of each episode as the robot was commanded,
     for some samples."""
     count, episodes, size = members.shape
-    stack, motion = Stack.of(data.setup.device), data.setup.known_motions.get(anatomy.name)
+    stack, motion = Stack.of(data.device), data.known_motions.get(anatomy.name)
     worlds = [FAMILY.world(each, motion) for each in members.reshape(-1, size)]
     starts = _as_deep(np.tile(data.start, (count, 1, 1)), np.array([each.ostium_mm for each in worlds]))
     commands = np.tile(data.command[:, :samples], (count, 1, 1, 1)).astype(float)
@@ -156,7 +157,7 @@ def _replayed(
     friction = stack.frictions(stack.wire.friction * np.array([each.friction_factor for each in worlds]))
     alike = [replace(each, friction_factor=1.0, ostium_mm=0.0) for each in worlds]
     devices = {each: each.stack(stack) for each in alike}  # members of one kind share the processor's lanes
-    cores = [(each.motion, each.core(data.setup.simulator)) for each in worlds]
+    cores = [(each.motion, each.core(data.simulator)) for each in worlds]
     for core in dict.fromkeys(cores):
         rows = np.array([k for k, each in enumerate(cores) if each == core])
         set_up = SimulationSetUp(
