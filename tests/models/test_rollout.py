@@ -57,14 +57,6 @@ def changed(episodes, value, samples, *names):
     return replace(episodes, **copies)
 
 
-def test_shapes(episodes):
-    predictor = untrained()
-    for rollout in (predictor.rollout_forward, predictor.rollout_inverse, predictor.rollout_dual):
-        result = rollout(episodes)
-        assert result.tip.shape == result.proximal.shape == result.control.shape == (16, 90, 2)
-        assert all(np.isfinite(signal).all() for signal in (result.tip, result.proximal, result.control))
-
-
 def test_forward_reads_no_tip_after_the_given_ones(episodes):
     blind = changed(episodes, np.nan, slice(GIVEN, None), "tip")
     predictor = untrained()

@@ -57,22 +57,24 @@ def advise(
 
     start = time.perf_counter()
     beside = output if str(run) == WIRES else run
-    data, follows = read_dataset(dataset), _follows(run)
+    data, model = read_dataset(dataset), follows(run)
     check_wire(run, read_run(run), data)
+    if str(run) == WIRES and (around := ", ".join(each.name for each in data.stack.catheters)):
+        raise InputError(f"{dataset}: its wire lies in {around}; make it without --catheter for {WIRES}, or name a run")
     fit, calibrating, test = (data.of_split(name) for name in ("train", "calibrate", "test"))
     check_enough(len(set(calibrating.anatomy)), config.adviser.level)
     others = [_other(run, folder, (fit, calibrating)) for folder in also_test]
     inputs = run_inputs(run) | {"dataset": data.manifest["key"]}
     inputs |= {"also_test": [other.manifest["key"] for other in others]}
     claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
-    (fitted, left_out), (own, *more) = (follow_all(part, follows, config) for part in (fit, calibrating))
+    (fitted, left_out), (own, *more) = (follow_all(part, model, config) for part in (fit, calibrating))
     left_out += more[0]
     bands = monitoring.calibrate(fitted, own, config.adviser.level, data.manifest["key"])
     share, curve = monitoring.least_offset_share(
-        lambda tried: follow_all(calibrating, follows, config, tried)[0], bands, config.adviser.missed
+        lambda tried: follow_all(calibrating, model, config, tried)[0], bands, config.adviser.missed
     )
     calibration = replace(bands, offset_share=share)
-    found, more = follow_all(test, follows, config, calibration)
+    found, more = follow_all(test, model, config, calibration)
     at = measure(found)
     content = {
         "calibration": calibration,
@@ -81,7 +83,7 @@ def advise(
         "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"]
         / max(at["periodic_exposures_per_minute_with_the_same_missed_share"], 1e-9),
         "curves": {"adviser": curve},
-        "made_otherwise": [_measure_otherwise(other, data, follows, calibration, config) for other in others],
+        "made_otherwise": [_measure_otherwise(other, data, model, calibration, config) for other in others],
         "patients_not_registered": [*left_out, *more],
         "manifest": manifest(
             config=config,
@@ -102,8 +104,8 @@ def advise(
     return content
 
 
-def _follows(run: Path) -> monitoring.Follows:
-    """Return what makes the follower of a navigation: the agent's belief, or the networks of a run."""
+def follows(run: Path) -> monitoring.Follows:
+    """Return what makes what follows a navigation: the agent's belief (`wires`), or the networks of a run."""
     if str(run) == WIRES:
         return lambda navigation, calibration, advice: Monitor(navigation, calibration, advice=advice)
     from endopilot.models.checkpoint import load_model  # brings torch
@@ -134,11 +136,11 @@ def _other(run: Path, folder: Path, ours: Sequence[Dataset]) -> Dataset:
 
 
 def _measure_otherwise(
-    test: Dataset, calibrated: Dataset, follows: monitoring.Follows, calibration: Calibration, config: AdviseConfig
+    test: Dataset, calibrated: Dataset, model: monitoring.Follows, calibration: Calibration, config: AdviseConfig
 ) -> dict[str, Any]:
     """Return what the calibrated adviser misses and costs on navigations that were made otherwise, and how."""
     theirs, ours = (_leaves(data.manifest["config"]) for data in (test, calibrated))
-    found, left_out = follow_all(test, follows, config, calibration)
+    found, left_out = follow_all(test, model, config, calibration)
     return {
         "dataset": str(test.folder),
         "differs": {name: value for name, value in theirs.items() if value != ours.get(name)},
