@@ -20,7 +20,7 @@ from endopilot.belief.network_monitor import NetworkMonitor
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json, writing
-from endopilot.models.config import WIRES, read_run, run_inputs
+from endopilot.models.config import WINDOW, WIRES, read_run, run_inputs
 from endopilot.models.episodes import check_wire
 from endopilot.runs import claim
 
@@ -107,7 +107,7 @@ def advise(
 def follows(run: Path) -> monitoring.Follows:
     """Return what makes what follows a navigation: the agent's belief (`wires`), or the networks of a run."""
     if str(run) == WIRES:
-        return lambda navigation, calibration, advice: Monitor(navigation, calibration, advice=advice)
+        return lambda navigation, bands, advice: Monitor(navigation, bands, advice=advice, settles=WINDOW)
     from endopilot.models.checkpoint import load_model  # brings torch
 
     return partial(NetworkMonitor, load_model(run))

@@ -129,6 +129,7 @@ class Monitor:
         advice: AdviserConfig | None = None,
         members: Sequence[World] | None = None,
         pace: Pace | None = None,
+        settles: int = 0,
     ) -> None:
         """Lay out the simulated wires at the start of a navigation.
 
@@ -137,6 +138,8 @@ class Monitor:
                 neither asks for X-ray nor changes its belief.
             members: what the simulated wires take reality to be; around what is given if not given.
             pace: what each step grants the search for what explains the exposures; if not given, one waits for it all.
+            settles: exposures before another belief is sought, such as in a time under X-ray: all of them tell more
+                than the first few.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config) if members is None else tuple(members)
@@ -147,7 +150,7 @@ class Monitor:
         self.seen: TipMeasurement | None = None
         self._tests, self._loads = calibration is not None and not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        self._pace, self._thought = pace or Pace(), None
+        self._pace, self._thought, self._settles, self._alarmed = pace or Pace(), None, settles, False
         self._watch, self._innovations = None, Innovations()
         if calibration is not None:
             tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
@@ -236,9 +239,11 @@ class Monitor:
         self.belief.weigh(seen)
         self.sought = not self.belief.explains and self.belief.seek(seen)
         self._innovations.alarm |= self._tests and not self.belief.explains
-        self._since += 1
+        self._since, self._alarmed = self._since + 1, self._alarmed or self.alarm
+        if (shown := len(self.past.exposures)) == self._settles:
+            self._innovations.alarm |= self._alarmed
         seeks_motion, changes = self._may_move(), self._is_to_change()
-        if self._thought is None and (seeks_motion or changes):
+        if self._thought is None and shown >= self._settles and (seeks_motion or changes):
             self._thought = self._explaining(seeks_motion=seeks_motion, changes=changes)
 
     def _explaining(self, *, seeks_motion: bool, changes: bool) -> Thought[Explanation | None]:
