@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -22,17 +23,18 @@ from endopilot.cli import main
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
-from endopilot.files import write_json
+from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import OpenLoop
 from endopilot.simulation.world import World
 from toy_navigation import make_toy_dataset
 
 CONFIG = AdviseConfig(adviser=AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8))
-SHAPE = {"patients": 12, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
-SHARES = (1 / 12, 10 / 12, 1 / 12)
+SHAPE = {"patients": 4, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
+SHARES = (1 / 4, 2 / 4, 1 / 4)
 LATER = 50 - WINDOW
 
 
@@ -68,7 +70,7 @@ class Asks:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Return a folder with a dataset of twelve toy patients, ten of which calibrate, and a run."""
+    """Return a folder with a dataset of four toy patients, two of which calibrate, and a run."""
     folder = tmp_path_factory.mktemp("advice")
     make_toy_dataset(folder / "dataset", **SHAPE, anatomy_shares=SHARES)
     record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("workhorse-014"))}
@@ -210,41 +212,48 @@ def test_the_command_calibrates_measures_and_draws(folder, tmp_path, capsys) -> 
     run, dataset, output = folder / "run", folder / "dataset", folder / "out"
     others = [str(dataset), str(tmp_path / "other")]
     with pytest.raises(SystemExit) as leave:
-        main(["advise", str(run), str(dataset), "-o", str(output), "--abscissa-mm", "0.8", "--also-test", *others])
+        main(["advise", str(run), str(dataset), "-o", str(output), "--level", "0.5", "--also-test", *others])
     assert leave.value.code == 0
     printed = capsys.readouterr().out
     assert "missed_share" in printed and "exposures_per_minute" in printed
     figures = json.loads((output / "advice.json").read_text(encoding="utf-8"))
     assert Calibration.read(run).scale == figures["calibration"]["scale"] > 0
-    assert figures["calibration"]["anatomies"] == 10 and figures["coverage"]["patients"] == 1
-    assert 0 <= figures["coverage"]["simultaneous"] <= figures["coverage"]["samplewise"] <= 1
+    assert figures["calibration"]["anatomies"] == 2 and figures["coverage"]["patients"] == 1
+    assert 0 <= figures["coverage"]["simultaneous"] <= 1 and 0 <= figures["coverage"]["samplewise"] <= 1
     assert (output / "advice.png").stat().st_size > 10_000
     assert figures["adviser"]["offset_share"] == figures["calibration"]["offset_share"]
     same, other = figures["made_otherwise"]
     assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
     assert same["coverage"] == figures["coverage"] and same["adviser"].items() <= figures["adviser"].items()
     with pytest.raises(InputError, match="which the bands are fitted to"):
-        advise(run, dataset, tmp_path / "no", AdviseConfig(), also_test=[tmp_path / "all"])
+        advise(
+            run, dataset, tmp_path / "no", AdviseConfig(adviser=AdviserConfig(level=0.5)), also_test=[tmp_path / "all"]
+        )
     assert not (tmp_path / "no").exists()
 
 
 def test_too_few_patients_another_wire_or_no_run_leave_nothing_behind(folder, tmp_path) -> None:
-    config, out = AdviseConfig(adviser=AdviserConfig(level=0.95)), tmp_path / "out"
-    with pytest.raises(InputError, match="needs at least 19 patients"):
-        advise(folder / "run", folder / "dataset", out, config)
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="needs at least 9 patients"):
+        advise(folder / "run", folder / "dataset", out, AdviseConfig())
     with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
         advise(tmp_path / "no-run", folder / "dataset", out, AdviseConfig())
     record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("j-035"))}
     write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
         advise(tmp_path, folder / "dataset", out, AdviseConfig())
+    shutil.copytree(folder, tmp_path / "pairs")
+    manifest = tmp_path / "pairs/dataset/meta/manifest.json"
+    write_json(manifest, read_json(manifest) | {"catheters": [asdict(read_catheter("microcatheter-1.7f"))]})
+    with pytest.raises(InputError, match=r"its wire lies in microcatheter-1\.7f; make it without --catheter for wires"):
+        advise(Path("wires"), tmp_path / "pairs/dataset", out, AdviseConfig())
     assert not out.exists() and not (tmp_path / "xray.json").exists()
 
 
 def test_simulated_wires_are_followed_by_the_belief_of_the_agent(fork, tmp_path) -> None:
     """A deeper ostium is identified from the first 15 s, and the tip then known without X-ray."""
     wire = read_wire("workhorse-014")
-    config = DatasetConfig(sequences=1, seconds=18.0, seed=3)
+    config = DatasetConfig(sequences=1, seconds=18.0, seed=3, seen_test_share=0.0)
     write_anatomy(fork, output=tmp_path / "fork")
     generate_dataset([tmp_path / "fork"], output=tmp_path / "d", device=wire, config=config, world=World(ostium_mm=2.5))
     (followed_by,) = Patient(read_dataset(tmp_path / "d"), AdviseConfig()).navigations
