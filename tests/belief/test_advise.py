@@ -51,7 +51,7 @@ class HoldSlack:
     rollout_inverse = rollout_dual = rollout_forward
 
 
-class Asks:
+class Asks(NetworkMonitor):
     """Believes what it was shown last, and asks for X-ray at every so many-th sample."""
 
     def __init__(self, every: int) -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, Predicted
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.belief.events import Counted, astray_mm, count_events
-from endopilot.belief.monitor import BelievedTip
+from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.belief.network_monitor import NetworkMonitor
 from endopilot.dataset.loader import Dataset
-from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
 from endopilot.progress import progress
@@ -52,20 +52,8 @@ class AdviseConfig:
     """Seed of the detection errors, of the ostia, and of the patients' poses."""
 
 
-@runtime_checkable
-class Follower(Protocol):
-    """What follows a wire that somebody drives, such as a `Monitor`."""
-
-    @property
-    def predicted(self) -> Predicted:
-        """The tip as predicted at the last step."""
-        ...
-
-    def step(self, encoders: Proximals, load: Proximals = (), exposure: TipMeasurement | None = None) -> BelievedTip:
-        """Take what is measured, a period after the last; see `Monitor.step`."""
-        ...
-
-
+Follower = Monitor | NetworkMonitor
+"""What follows a wire that somebody drives."""
 Follows = Callable[[Navigation, Calibration | None, AdviserConfig], Follower]
 """Makes what follows the wire of a navigation; without a calibration it only predicts."""
 Rows = Float[np.ndarray, "samples 2"]
