@@ -29,8 +29,11 @@ from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import OpenLoop
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
-from toy_navigation import make_toy_dataset
+from endopilot.xray.fluoroscope import TipMeasurement
+from endopilot.xray.image_fluoroscope import NotRegistered
+from toy_navigation import make_toy_dataset, toy_run
 
 CONFIG = AdviseConfig(adviser=AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8))
 SHAPE = {"patients": 4, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
@@ -139,6 +142,42 @@ def test_networks_go_on_from_what_x_ray_showed(data) -> None:
     advance = np.diff(found.length_mm).cumsum()
     np.testing.assert_allclose(found.predicted[1:, 0], found.predicted[0, 0] + advance, atol=1e-5)
     assert (found.predicted[1:, 1] == found.predicted[0, 1]).all() and not found.spread.any()
+
+
+class Arm:
+    """Measures the foremost node as it is; does not recognise one patient."""
+
+    def __init__(self, navigation, **_) -> None:
+        self.known_motion, self.forgot = navigation.known_motion, 0
+        if navigation.anatomy.name.endswith("-1x"):
+            raise NotRegistered(f"X-ray images: {navigation.anatomy.name} cannot be registered: nothing seen")
+
+    def measure_motion(self, motion, random) -> Motion:
+        return replace(motion, breathing_caudal_mm=motion.breathing_caudal_mm - 1.5)
+
+    def forget_wires(self) -> None:
+        self.forgot += 1
+
+    def measure(self, nodes, inserted_length, random) -> TipMeasurement:
+        return TipMeasurement(nodes[0], float(nodes[0][0]), float(nodes[0][1]), 0)
+
+
+def test_with_images_the_wire_is_driven_again_and_shown_as_far_as_its_motion_is_not_known(folder, monkeypatch) -> None:
+    monkeypatch.setattr(monitoring, "make_c_arm", Arm)
+    monkeypatch.setattr("endopilot.dataset.loader.run_set_up", toy_run)
+    data, config = read_dataset(folder / "dataset"), replace(CONFIG, xray="images")
+    still, left_out = monitoring.follow_all(data, lambda *_: Asks(1), config, BANDS)
+    assert left_out == ["patient-1x"] and len(still) == 3
+    for each in still:
+        np.testing.assert_allclose(each.predicted, each.true, atol=1e-4)
+    with pytest.raises(InputError, match=r"no patient of its split .* can be registered; first: X-ray images"):
+        monitoring.follow_all(data[data.anatomy == "patient-1x"], lambda *_: Asks(1), config)
+    motion = replace(Motion(), breathing_caudal_mm=8.0)
+    monkeypatch.setattr(Dataset, "motion", lambda self, name: motion)
+    patient = Patient(data[data.anatomy == "patient-0"], config)
+    assert patient.navigations[0].known_motion == replace(motion, breathing_caudal_mm=6.5)
+    moved = patient.follow(0, Asks(1), asked=True)
+    assert 0.01 < np.abs(moved.predicted - moved.true).max() < 0.5
 
 
 def followed(patient: str, error: np.ndarray, half: float = np.nan, missed: int = 0) -> Followed:

@@ -123,8 +123,7 @@ class Patient:
         self._arm: Any = make_c_arm(given, config=config.fluoroscope, seed=seed)
         if config.xray == "images" and motion is not None:
             self._arm.known_motion = self._arm.measure_motion(motion, self._random(6))
-        self._beside_mm, known = np.array(world.registration_mm), self._arm.known_motion
-        ostium = np.asarray(anatomy.insertion.position)
+        self._world, known, ostium = world, self._arm.known_motion, np.asarray(anatomy.insertion.position)
         self._moves = seen_in_episodes(motion, known, ostium, data.valid.shape[1], SAMPLE_PERIOD_S)
         self._tree, self._true = anatomy.tree, data
         self._shape = data.driven(anatomy=anatomy, record_shape=True).shape if config.xray == "images" else None
@@ -146,17 +145,17 @@ class Patient:
     def _exposed(self, number: int, sample: int) -> TipMeasurement | None:
         """Return what an exposure at a sample of a navigation shows; None where no wire is found."""
         true, at, moves = self._true, (number, sample), self._moves
+        beside_mm = np.array(self._world.registered_mm(SAMPLE_PERIOD_S * (sample + 1)))
 
         def seen(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-            return points + self._beside_mm if moves is None else place(moves[sample], points + self._beside_mm)
+            return points + beside_mm if moves is None else place(moves[sample], points + beside_mm)
 
         length, random = float(self._encoders[number, sample, 0]), self._random(3, self._sequence[number], sample)
         if self._shape is not None:
             return self._arm.measure(seen(self._shape[at]), length, random)
         tip, heading = (each[at][0].astype(float) for each in (true.tip_position, true.tip_direction))
-        return self._arm.measure(
-            seen(tip), heading if moves is None else turned(moves[sample], heading), length, random
-        )
+        heading = heading if moves is None else turned(moves[sample], heading)
+        return self._arm.measure(seen(tip), heading, length, random)
 
     def follow(self, number: int, follower: Follower, *, asked: bool) -> Followed:
         """Follow a navigation: X-ray is on at the first `WINDOW` samples, and then as it is asked for, if `asked`."""
@@ -215,10 +214,10 @@ def follow_all(
                 patient = Patient(data[data.anatomy == name], config)
             except NotRegistered as error:
                 bad[name] = error
-                continue
-            for number, navigation in enumerate(patient.navigations):
-                follower = follows(navigation, calibration, config.adviser)
-                found.append(patient.follow(number, follower, asked=calibration is not None))
+            else:
+                for number, navigation in enumerate(patient.navigations):
+                    follower = follows(navigation, calibration, config.adviser)
+                    found.append(patient.follow(number, follower, asked=calibration is not None))
             advance(remark=name)
     if not found:
         first = next(iter(bad.values()))
