@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from endopilot import __version__
 from endopilot.belief import monitoring
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
@@ -67,14 +65,13 @@ def advise(
     inputs = run_inputs(run) | {"dataset": data.manifest["key"]}
     inputs |= {"also_test": [other.manifest["key"] for other in others]}
     claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
-    (fitted, left_out), (own, *more) = (follow_all(part, model, config) for part in (fit, calibrating))
-    left_out += more[0]
+    (fitted, left_out), (own, left_out_too) = (follow_all(part, model, config) for part in (fit, calibrating))
     bands = monitoring.calibrate(fitted, own, config.adviser.level, data.manifest["key"])
     share, curve = monitoring.least_offset_share(
         lambda tried: follow_all(calibrating, model, config, tried)[0], bands, config.adviser.missed
     )
     calibration = replace(bands, offset_share=share)
-    found, more = follow_all(test, model, config, calibration)
+    found, left_out_of_test = follow_all(test, model, config, calibration)
     at = measure(found)
     content = {
         "calibration": calibration,
@@ -84,7 +81,7 @@ def advise(
         / max(at["periodic_exposures_per_minute_with_the_same_missed_share"], 1e-9),
         "curves": {"adviser": curve},
         "made_otherwise": [_measure_otherwise(other, data, model, calibration, config) for other in others],
-        "patients_not_registered": [*left_out, *more],
+        "patients_not_registered": [*left_out, *left_out_too, *left_out_of_test],
         "manifest": manifest(
             config=config,
             seed=config.seed,
@@ -168,8 +165,7 @@ def _picture(content: Mapping[str, Any]) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.0), layout="constrained")
         axes = figure.add_subplot()
-        even = np.linspace(0.0, 60 / monitoring.SAMPLE_PERIOD_S / 2, 2)
-        axes.plot(even, [100.0, 0.0], color=GREY, label="Periodic imaging")
+        axes.plot([0.0, monitoring.periodic_per_minute(0.0)], [100.0, 0.0], color=GREY, label="Periodic imaging")
         curve = [(each["exposures_per_minute"], 100 * each["missed_share"]) for each in content["curves"]["adviser"]]
         label = "Shares of γtip's band, calibration patients"
         axes.plot(*zip(*curve, strict=True), color=BLUE, marker="o", markersize=3.5, label=label)
