@@ -17,6 +17,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import fill
 from endopilot.dataset.loader import read_dataset
+from endopilot.devices.stack import Stack
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -67,7 +68,7 @@ def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConf
 
 
 def _held(episodes: Episodes, rollouts: list[Trajectory]) -> str:
-    limit = HELD * episodes.device.pull_limit_n
+    limit = HELD * Stack.of(episodes.device).wire.pull_limit_n
     return f"{100 * np.mean(np.concatenate([(r.base_force < -limit).ravel() for r in rollouts])):.2f} %"
 
 
