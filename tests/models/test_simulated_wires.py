@@ -77,7 +77,7 @@ def test_a_wire_in_a_catheter_is_predicted_and_led_too(patient, tmp_path):
     wires = SimulatedWires()
     assert np.median(error_mm(wires.rollout_forward(both).tip, both)) < 0.2
     still = replace(both, command=both.command * np.array([[1.0], [0.0]]))  # the catheter stays
-    assert np.abs(wires.rollout_forward(still).tip - both.tip[:, LATER]).max() > 1.0
+    assert np.abs(wires.rollout_forward(still).tip - both.tip[:, LATER]).max() > 0.5
     assert np.median(error_mm(wires.rollout_dual(both).tip, both)) < 0.5
 
 
