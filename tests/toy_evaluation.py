@@ -106,8 +106,5 @@ def make_result(anatomies: tuple[str, ...] = ("a", "b"), episodes: int = 6, seed
             "training_mean": np.zeros_like(control),
             "follow_slack": control + random.normal(0, 1.0, control.shape),
         },
-        base_force={name: random.normal(0, 0.1, size) for name in ("true", *simulated)},
-        base_torque={name: random.normal(0, 0.1, size) for name in ("true", *simulated)},
-        events={name: random.random(size) < share for name, share in (("stick", 0.1), ("slip", 0.05), ("whip", 0.0))},
         tip_distance={name: np.abs(random.normal(0, scales[name], size)) for name in simulated},
     )

@@ -18,6 +18,7 @@ from endopilot import _core
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
@@ -174,10 +175,10 @@ def make_untrained_run(dataset_folder, run_folder):
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():
         write_network(run_folder / f"{name}.safetensors", name, network(size), size)
-    device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
+    device, data = read_json(dataset_folder / "meta" / "manifest.json")["device"], read_dataset(dataset_folder)
     record = {
         "config": {"model": "paper"},
-        "inputs": {"dataset": read_json(dataset_folder / "meta" / "manifest.json")["key"]},
+        "patients": [data.patients[name] for name in set(data.of_split("train").anatomy.tolist())],
         "dataset": os.path.relpath(dataset_folder, run_folder),
         "networks": {"ff": {}, "if": {}},
         "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},

@@ -17,6 +17,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import fill
 from endopilot.dataset.loader import read_dataset
+from endopilot.devices.stack import Stack
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -52,11 +53,9 @@ def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Trajec
     rollouts, start = [], time.process_time()
     for name in np.unique(episodes.anatomy):
         data = episodes.select(episodes.anatomy == name)
-        anatomy, device = episodes.setup.anatomies[str(name)](), episodes.setup.device
-        rollouts.append(
-            simulate(anatomy, device, data.command, initial=data.initial, config=replace(config, threads=1))
-        )
-    return rollouts, 0.5 * episodes.branch.size / (time.process_time() - start)
+        anatomy, device = episodes.anatomies[str(name)](), episodes.device
+        rollouts.append(simulate(anatomy, device, data.command, initial=data.start, config=replace(config, threads=1)))
+    return rollouts, 0.5 * episodes.tip[..., 0].size / (time.process_time() - start)
 
 
 def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConfig) -> list[str]:
@@ -69,7 +68,7 @@ def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConf
 
 
 def _held(episodes: Episodes, rollouts: list[Trajectory]) -> str:
-    limit = HELD * episodes.setup.device.pull_limit_n
+    limit = HELD * Stack.of(episodes.device).wire.pull_limit_n
     return f"{100 * np.mean(np.concatenate([(r.base_force < -limit).ravel() for r in rollouts])):.2f} %"
 
 

@@ -18,7 +18,9 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.figures import fill
-from endopilot.belief import monitoring
+from endopilot.belief.advise import follows
+from endopilot.belief.bands import Calibration
+from endopilot.belief.monitoring import AdviseConfig, Followed, calibrate, coverage, follow_all, measure
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.evaluation.protocols import hold_slack
 from endopilot.files import read_json, write_json
@@ -56,25 +58,22 @@ def measured(folder: Path, model: str) -> dict[str, Any]:
     start = time.process_time()
     tip = load_model(run).rollout_forward(episodes).tip
     found: dict[str, Any] = {"p1_cpu_s_per_nav": (time.process_time() - start) / len(episodes)}
-    found["p1"], config = spans(np.abs(tip - episodes.tip[:, WINDOW:])), monitoring.AdviseConfig()
-    fitted, own = (
-        monitoring.monitor(load_model(run), first_of_each(folder / "dataset", split), config, samples=samples)
-        for split, samples in (("train", WINDOW), ("calibrate", None))
-    )
-    bands = monitoring.calibrate(fitted, own, config.adviser)
+    found["p1"], config = spans(np.abs(tip - episodes.tip[:, WINDOW:])), AdviseConfig()
+
+    def followed(name: str, split: str, bands: Calibration | None = None) -> list[Followed]:
+        return follow_all(first_of_each(folder / name, split), follows(Path(run)), config, bands)[0]
+
+    fitted, own = (followed("dataset", split) for split in ("train", "calibrate"))
+    bands = calibrate(fitted, own, config.adviser.level, "")
     for world in WORLDS:
-        test = monitoring.monitor(load_model(run), first_of_each(folder / world, "test"), config)
-        cover = monitoring.coverage(test, bands)
-        advised = monitoring.adviser_policy(test, bands, config.adviser)
-        policy = monitoring.measure_policy(test, advised, config.adviser)
-        even = monitoring.measure_metronome(test, policy["exposures_per_minute"], config.adviser)
+        test = followed(world, "test", bands)
+        cover, policy = coverage(test), measure(test)
         found[world] = {
             "cover": cover["simultaneous"],
             "samplewise": cover["samplewise"],
-            "half": cover["median_half_width_mm"],
             "mae": cover["error_mae_mm"],
             "missed": policy["missed_share"],
-            "evenly": even["missed_share"],
+            "evenly": policy["missed_evenly_share"],
             "exposures": policy["exposures_per_minute"],
             "n": cover["intervals"],
         }
@@ -86,7 +85,7 @@ def p1_rows(folder: Path, models: dict[str, dict[str, Any]]) -> Iterator[str]:
     yield "| | Δtip | γtip | processor, s a navigation |"
     yield "|---|---|---|---|"
     data = first_of_each(folder / "dataset", "test")
-    held = np.abs(hold_slack(data, WINDOW) - Episodes.of_dataset(data).tip[:, WINDOW:])
+    held = np.abs(hold_slack(data) - Episodes.of_dataset(data).tip[:, WINDOW:])
     for name, p1, seconds in [
         *((MODELS[name], found["p1"], f"{found['p1_cpu_s_per_nav']:.1f}") for name, found in models.items()),
         ("held slack and offset", spans(held), "–"),

@@ -56,7 +56,6 @@ from .models.checkpoint import load_model as load_model
 from .models.config import TrainConfig as TrainConfig
 from .models.config import TransformerConfig as TransformerConfig
 from .models.episodes import Episodes as Episodes
-from .models.episodes import EpisodeSetUp as EpisodeSetUp
 from .models.episodes import OpenLoop as OpenLoop
 from .models.episodes import Predictor as Predictor
 from .models.train import train as train

@@ -1,35 +1,44 @@
-"""X-ray advice on a toy wire: what counts as an event, which are missed, and the whole command."""
+"""X-ray advice on a toy wire: what is followed, which events are missed, and the whole command."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, astuple, replace
+import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from endopilot.belief import advise as advise_module
+from endopilot.anatomy.io import write_anatomy
 from endopilot.belief import monitoring
 from endopilot.belief.advise import advise
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
-from endopilot.belief.image_exposures import Exposures
-from endopilot.belief.monitoring import AdviseConfig
-from endopilot.belief.online_predictors import OnlinePredictor, OnlineWindowed, OnlineWires, online_predictor
+from endopilot.belief.events import Counted
+from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.belief.monitoring import AdviseConfig, Followed, Patient
+from endopilot.belief.network_monitor import NetworkMonitor
 from endopilot.cli import main
-from endopilot.dataset.loader import read_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
+from endopilot.dataset.loader import Dataset, read_dataset
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
-from endopilot.files import write_json
+from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import OpenLoop
-from endopilot.models.simulated_wires import SimulatedWires
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.world import World
-from toy_navigation import make_toy_dataset
+from endopilot.xray.fluoroscope import TipMeasurement
+from endopilot.xray.image_fluoroscope import NotRegistered
+from toy_navigation import make_toy_dataset, toy_run
 
-EVENTS = AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8)
+CONFIG = AdviseConfig(adviser=AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8))
+SHAPE = {"patients": 4, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
+SHARES = (1 / 4, 2 / 4, 1 / 4)
+LATER = 50 - WINDOW
 
 
 class HoldSlack:
@@ -42,310 +51,254 @@ class HoldSlack:
         tip = np.stack([length[:, WINDOW:] - slack, offset.astype(float)], axis=-1)
         return OpenLoop(tip=tip, proximal=tip, control=tip)
 
-    rollout_inverse = rollout_forward
+    rollout_inverse = rollout_dual = rollout_forward
 
-    def rollout_dual(self, episodes, observed=None) -> OpenLoop:
-        return self.rollout_forward(episodes)
+
+class Asks(NetworkMonitor):
+    """Believes what it was shown last, and asks for X-ray at every so many-th sample."""
+
+    def __init__(self, every: int) -> None:
+        self.every, self.steps, self.shown, self.lengths = every, 0, list[int](), list[float]()
+        self.predicted = Predicted(np.zeros(2), np.zeros(2), np.zeros(2), 1.5)
+
+    def step(self, encoders, load=(), exposure=None) -> BelievedTip:
+        if exposure is not None:
+            self.shown.append(self.steps - 1)  # the first step is the start
+            self.predicted = Predicted(np.zeros(2), np.array([exposure.abscissa, exposure.offset]), np.ones(2), 1.5)
+        self.lengths.append(encoders[0][0])
+        self.steps += 1
+        where = self.predicted.tip.tolist()
+        return BelievedTip(where[0], where[1], (1.0, 1.0), "it is time" if self.steps % self.every == 0 else "", "", 0)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Return a folder with a dataset of twelve toy patients, ten of which calibrate, and a run."""
+    """Return a folder with a dataset of four toy patients, two of which calibrate, and a run."""
     folder = tmp_path_factory.mktemp("advice")
-    shares = (1 / 12, 10 / 12, 1 / 12)
-    shape = {"patients": 12, "sequences": 1, "seconds": 25.0}
-    make_toy_dataset(folder / "dataset", **shape, anatomy_shares=shares, seen_test_share=0.0)
-    record = {"config": {}, "networks": {}, "device": asdict(read_wire("workhorse-014"))}
+    make_toy_dataset(folder / "dataset", **SHAPE, anatomy_shares=SHARES)
+    record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("workhorse-014"))}
     write_json(folder / "run" / "manifest.json", record)
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def hold_slack(monkeypatch) -> None:
     monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda run: HoldSlack())
 
 
-@pytest.fixture(scope="module")
-def split(folder) -> monitoring.Monitored:
-    return monitoring.monitor(HoldSlack(), read_dataset(folder / "dataset").of_split("calibrate"), AdviseConfig())
-
-
-def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(split, folder) -> None:
-    error = split.episodes.tip[..., 0] - split.truth[..., 0]
-    assert 0.1 < error.std() < 0.8
-    truth = read_dataset(folder / "dataset").of_split("calibrate")
-    ostium = truth.inserted_length[..., 0] - split.episodes.proximal[..., 0]
-    assert np.ptp(ostium, axis=1).max() < 1e-4 and 0.1 < np.abs(ostium).max() <= 0.3
-    np.testing.assert_allclose(truth.initial[:, 0, 0] - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
-    np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation[..., 0])
-
-
-def test_encoders_and_exposures_err_as_the_world_of_the_dataset_says(split, folder) -> None:
+@pytest.fixture
+def data(folder) -> Dataset:
     data = read_dataset(folder / "dataset").of_split("calibrate")
+    return data[data.anatomy == data.anatomy[0]]
+
+
+def test_x_ray_is_on_at_first_and_then_as_asked_and_shows_what_the_encoder_does_not(data) -> None:
+    patient, asks = Patient(data, CONFIG), Asks(7)
+    found = patient.follow(0, asks, asked=True)
+    assert asks.shown == [*range(WINDOW), 34, 41, 48] and asks.steps == 51
+    assert np.flatnonzero(found.exposed).tolist() == [0, 5, 12, 19]
+    ostium = data.inserted_length[0, :, 0] - np.array(asks.lengths[1:])
+    assert np.ptp(ostium) < 1e-4 and 0.0 < np.abs(ostium).max() <= 0.3
+    error = found.predicted[found.exposed] - found.true[found.exposed]
+    assert 0.0 < np.abs(error).max() < 2.0  # what X-ray shows, with its errors
+    blind = Asks(7)
+    assert patient.follow(0, blind, asked=False).exposed.tolist() == [True] + [False] * LATER
+
+
+def test_encoders_and_exposures_err_as_the_world_of_the_dataset_says(data) -> None:
     world = World(ostium_mm=0.7, registration_mm=(0.4, 0.0, 0.0))  # along the vessel
     changed = replace(data, manifest=data.manifest | {"world": world.differences()})
-    found = monitoring.monitor(HoldSlack(), changed, AdviseConfig())
-    np.testing.assert_allclose(found.proximal[..., 0], split.proximal[..., 0] - 0.7, atol=1e-6)
-    assert (found.truth == split.truth).all()
-    along = (found.episodes.tip - split.episodes.tip)[..., 0]
-    assert np.median(along) == pytest.approx(0.4, abs=0.1)
+    (as_given, there), (before, after) = (Asks(1), Asks(1)), (Patient(data, CONFIG), Patient(changed, CONFIG))
+    seen, moved = before.follow(0, as_given, asked=True), after.follow(0, there, asked=True)
+    np.testing.assert_allclose(np.array(there.lengths[1:]), np.array(as_given.lengths[1:]) - 0.7, atol=1e-6)
+    np.testing.assert_array_equal(moved.true, seen.true)
+    assert np.median((moved.predicted - seen.predicted)[:, 0]) == pytest.approx(0.4, abs=0.1)
 
 
-def test_imaging_often_enough_shows_every_event_and_none_shows_no_event(split) -> None:
-    often = monitoring.measure_policy(split, monitoring.periodic_policy(split, 2), EVENTS)
-    never = monitoring.measure_policy(split, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
-    knowing = monitoring.measure_policy(split, monitoring.oracle_policy(split, EVENTS), EVENTS)
-    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(60.0, rel=0.02)
-    assert monitoring.measure_metronome(split, often["exposures_per_minute"], EVENTS) == often
-    assert never["missed_share"] == 1.0  # X-ray was on until the first sample, before all of them
-    assert never["exposures_per_minute"] == 0.0
-    assert never["events_per_minute"] > 1.0 and never["fewer_frames_than_fluoroscopy"] == 1.0
-    assert knowing["missed_share"] == 0.0
-    assert knowing["exposures_per_minute"] <= knowing["events_per_minute"]  # one exposure may show two events
+def test_an_image_in_which_no_wire_is_found_counts_shows_nothing_and_is_taken_again(data, monkeypatch) -> None:
+    patient = Patient(data, CONFIG)
+    whole = patient.follow(0, Asks(7), asked=True)
+    expose = patient._exposed
+    monkeypatch.setattr(patient, "_exposed", lambda number, sample: None if sample == 34 else expose(number, sample))
+    parts, asks = None, Asks(7)
+    parts = patient.follow(0, asks, asked=True)
+    assert np.flatnonzero(parts.exposed & ~whole.exposed).tolist() == [6] and parts.exposed[5]
+    assert 34 not in asks.shown and 35 in asks.shown
 
 
-def test_an_observation_changes_later_predictions_and_nothing_before(split) -> None:
-    model = OnlineWindowed(HoldSlack(), split.episodes)
-    before = model.tip.copy()
-    model.observe(np.array([1]), 34, np.array([[20.0, 0.4]]), np.array([0]))
-    np.testing.assert_array_equal(model.tip[:, :35], before[:, :35])
-    np.testing.assert_array_equal(model.tip[[0, 2]], before[[0, 2]])
-    length = split.episodes.proximal[1, :, 0]
-    np.testing.assert_allclose(model.tip[1, 35:, 0], length[35:] - (length[34] - 20.0), rtol=1e-5)
-    np.testing.assert_allclose(model.tip[1, 35:, 1], 0.4, rtol=1e-5)
-    model.reset()
-    np.testing.assert_array_equal(model.tip, before)
+def test_events_are_counted_from_the_truth_and_what_was_believed(data) -> None:
+    found = {every: Patient(data, CONFIG).follow(0, Asks(every), asked=True) for every in (1, 1000)}
+    often, never = (monitoring.measure([each]) for each in found.values())
+    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(120.0)
+    assert never["exposures_per_minute"] == 0.0 and never["missed_share"] == 1.0 == never["missed_evenly_share"]
+    assert never["fewer_frames_than_fluoroscopy"] == 1.0
+    assert never["wall_events_per_minute"] == often["wall_events_per_minute"] > 0.0
 
 
-def test_an_image_in_which_no_wire_is_found_shows_nothing_and_is_taken_again(split) -> None:
-    policy = monitoring.periodic_policy(split, 4)
-    whole = monitoring.follow_policy(split, policy, EVENTS)
-    at = int(np.flatnonzero(whole.exposed[0])[1])  # from the last given sample on
-    found = split.found.copy()
-    found[0, WINDOW - 1 + at] = False
-    unseen = replace(split, found=found)
-    parts = monitoring.follow_policy(unseen, monitoring.periodic_policy(unseen, 4), EVENTS)
-    assert np.flatnonzero(parts.exposed[0] & ~whole.exposed[0]).tolist() == [at + 1]
-    assert parts.exposed[0, at]  # it counts all the same
-    assert whole.shown[0, at] and not parts.shown[0, at] and parts.shown[0, at + 1]
-    np.testing.assert_array_equal(parts.exposed[1:], whole.exposed[1:])
+def test_networks_go_on_from_what_x_ray_showed(data) -> None:
+    navigation = Patient(data, CONFIG).navigations[0]
+    follower = NetworkMonitor(HoldSlack(), navigation, None, CONFIG.adviser)
+    found = Patient(data, CONFIG).follow(0, follower, asked=False)
+    advance = np.diff(found.length_mm).cumsum()
+    np.testing.assert_allclose(found.predicted[1:, 0], found.predicted[0, 0] + advance, atol=1e-5)
+    assert (found.predicted[1:, 1] == found.predicted[0, 1]).all() and not found.spread.any()
 
 
-def test_models_know_the_motion_that_images_have_measured(folder, split, monkeypatch) -> None:
-    truth = read_dataset(folder / "dataset").of_split("calibrate")
-    moves = replace(Motion(), breathing_caudal_mm=7.0)
+class Arm:
+    """Measures the foremost node as it is; does not recognise one patient."""
 
-    def images(dataset, settings) -> tuple[dict[str, Exposures], tuple[str, ...]]:
-        shown = {}
-        for name in sorted(set(dataset.anatomy.tolist())):
-            mine = split.episodes.select(np.flatnonzero(dataset.anatomy == name))
-            sd_mm, found = np.zeros(mine.tip.shape), np.ones(mine.branch.shape, dtype=bool)
-            motion = np.array(astuple(moves) if len(name) % 2 == 0 else ())
-            shown[name] = Exposures(mine.tip, mine.branch, sd_mm, found, motion)
-        return shown, ()
+    def __init__(self, navigation, **_) -> None:
+        self.known_motion, self.forgot = navigation.known_motion, 0
+        if navigation.anatomy.name.endswith("-1x"):
+            raise NotRegistered(f"X-ray images: {navigation.anatomy.name} cannot be registered: nothing seen")
 
-    monkeypatch.setattr(monitoring, "image_exposures", images)
-    found = monitoring.monitor(HoldSlack(), truth, AdviseConfig(xray="images"))
-    known = {name: moves for name in set(truth.anatomy.tolist()) if len(name) % 2 == 0}
-    assert known and found.episodes.setup.known_motions == known
-    np.testing.assert_array_equal(found.episodes.tip, split.episodes.tip)
+    def measure_motion(self, motion, random) -> Motion:
+        return replace(motion, breathing_caudal_mm=motion.breathing_caudal_mm - 1.5)
+
+    def forget_wires(self) -> None:
+        self.forgot += 1
+
+    def measure(self, nodes, inserted_length, random) -> TipMeasurement:
+        return TipMeasurement(nodes[0], float(nodes[0][0]), float(nodes[0][1]), 0)
 
 
-class Errs(OnlinePredictor):
-    """Errs by given amounts and states no spread."""
-
-    def __init__(self, tip: np.ndarray) -> None:
-        self.tip, self.spread = tip, np.zeros_like(tip)
-
-    def reset(self) -> None:
-        pass
-
-    def observe(self, episodes, sample, tip, branch, sd_mm) -> None:
-        pass
-
-
-class Straight(monitoring.Lumen):
-    """A lumen of one radius."""
-
-    def __init__(self, radius_mm: float) -> None:
-        self._radius_mm = radius_mm
-
-    def radius(self, branch, abscissa_mm) -> np.ndarray:
-        return np.full(len(branch), self._radius_mm)
+def test_with_images_the_wire_is_driven_again_and_shown_as_far_as_its_motion_is_not_known(folder, monkeypatch) -> None:
+    monkeypatch.setattr(monitoring, "make_c_arm", Arm)
+    monkeypatch.setattr("endopilot.dataset.loader.run_set_up", toy_run)
+    data, config = read_dataset(folder / "dataset"), replace(CONFIG, xray="images")
+    still, left_out = monitoring.follow_all(data, lambda *_: Asks(1), config, BANDS)
+    assert left_out == ["patient-1x"] and len(still) == 3
+    for each in still:
+        np.testing.assert_allclose(each.predicted, each.true, atol=1e-4)
+    with pytest.raises(InputError, match=r"no patient of its split .* can be registered; first: X-ray images"):
+        monitoring.follow_all(data[data.anatomy == "patient-1x"], lambda *_: Asks(1), config)
+    motion = replace(Motion(), breathing_caudal_mm=8.0)
+    monkeypatch.setattr(Dataset, "motion", lambda self, name: motion)
+    patient = Patient(data[data.anatomy == "patient-0"], config)
+    assert patient.navigations[0].known_motion == replace(motion, breathing_caudal_mm=6.5)
+    moved = patient.follow(0, Asks(1), asked=True)
+    assert 0.01 < np.abs(moved.predicted - moved.true).max() < 0.5
 
 
-def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
+def followed(patient: str, error: np.ndarray, half: float = np.nan, missed: int = 0) -> Followed:
+    """Return a navigation of twenty samples in which predictions err, and events are missed, by so much."""
+    samples = len(error) + 1
+    predicted = np.concatenate([np.zeros((1, 2)), error])
+    nothing, events = Counted(0, 0, 0.0), Counted(10, missed, 10.0)
+    return Followed(
+        patient=patient,
+        length_mm=np.linspace(0.0, 10.0, samples),
+        true=np.zeros((samples, 2)),
+        predicted=predicted,
+        spread=np.zeros((samples, 2)),
+        half_width=np.full((samples, 2), half),
+        exposed=np.arange(samples) % 5 == 0,
+        events={"wall": events, "astray": nothing, "force": nothing},
+    )
+
+
+def jumping(patients: int, seed: int) -> list[Followed]:
     """Return six navigations of each patient: Δtip errs by 0.1 mm or by many mm, γtip by 0.01 mm always."""
-    random, count = np.random.default_rng(seed), 6 * patients
-    chosen = np.arange(count) % len(split.truth)
-    truth = split.truth[chosen]
-    size = np.stack([0.1 * np.exp(2 * random.standard_normal(count)), np.full(count, 0.01)], axis=-1)
-    names = np.repeat([f"patient-{seed}-{k}" for k in range(patients)], 6)
-    return replace(
-        split,
-        truth=truth,
-        ratio=split.ratio[chosen],
-        episodes=replace(split.episodes.select(chosen), anatomy=names),
-        found=split.found[chosen],
-        model=Errs(truth + size[:, None] * random.standard_normal(truth.shape)),
-        lumen=Straight(1.0),
-    )
+    random = np.random.default_rng(seed)
+    size = [np.array([0.1 * np.exp(2 * random.standard_normal()), 0.01]) for _ in range(6 * patients)]
+    return [followed(f"{k % patients}", each * random.standard_normal((20, 2))) for k, each in enumerate(size)]
 
 
-def test_both_bands_hold_together_though_their_errors_are_spread_otherwise(split) -> None:
+def test_both_bands_hold_together_though_their_errors_are_spread_otherwise() -> None:
     """Δtip has rare large errors, γtip has not."""
-    calibration = monitoring.calibrate(jumping(split, 60, 0), jumping(split, 100, 1), AdviserConfig())
-    found = monitoring.coverage(jumping(split, 300, 2), calibration)
-    assert found["simultaneous"] == pytest.approx(0.9, abs=0.03)
-    assert all(0.9 < share < 0.995 for share in found["each_band"])  # neither is wider than the other has need of
+    bands = monitoring.calibrate(jumping(60, 0), jumping(100, 1), 0.9, "key")
+    half = [bands.half_width(*each.grown) for each in jumping(300, 2)]
+    held = np.array([(each.error <= h).all(axis=0) for each, h in zip(jumping(300, 2), half, strict=True)])
+    assert held.all(axis=1).mean() == pytest.approx(0.9, abs=0.03)
+    assert (held.mean(axis=0) > 0.9).all() and (held.mean(axis=0) < 0.995).all()  # neither is wider than needed
+    assert bands.longest_s == 10.0 and bands.anatomies == 100 and bands.intervals == 600
 
 
-def approaching(split, half: float) -> monitoring.Monitored:
-    """Return ten navigations of each of three patients, in which the tip comes to the wall at one of the samples.
-
-    The model puts it further from there than it is, by 5 % of a half-width in the first navigation, 15 % in the next.
-    """
-    count, samples = 30, split.truth.shape[1]
-    place = np.arange(count) % 10
-    arrived = np.arange(samples) >= (WINDOW + 3 + place)[:, None]
-    at_wall = EVENTS.wall_ratio * (1.0 - split.wire_radius_mm)
-    truth = np.stack([np.full((count, samples), 20.0), np.where(arrived, at_wall + 1e-6, 0.0)], axis=-1)
-    predicted = truth - np.stack([0 * arrived, arrived * half * (place[:, None] + 0.5) / 10], axis=-1)
-    chosen = np.zeros(count, dtype=int)
-    return replace(
-        split,
-        truth=truth,
-        ratio=np.where(arrived, 1.0, 0.0),
-        episodes=replace(split.episodes.select(chosen), anatomy=np.repeat(["a", "b", "c"], 10)),
-        found=split.found[chosen],
-        model=Errs(predicted),
-        lumen=Straight(1.0),
-    )
+def test_bands_hold_where_they_do_throughout_an_interval_without_x_ray() -> None:
+    error = np.zeros((20, 2))
+    error[7, 0] = 2.0  # in the second of four intervals; the fifth sample of each has X-ray
+    error[4] = 9.0
+    found = monitoring.coverage([followed("a", error, half=1.0), followed("b", 0 * error, half=np.inf)])
+    assert found["intervals"] == 8 and found["patients"] == 2
+    assert found["each_band"] == [3 / 8, 4 / 8] and found["simultaneous"] == 3 / 8  # infinite ones hold nothing
+    assert found["samplewise"] == 15 / 32 and found["worst_decile_of_patients"] == 0.0
 
 
-@pytest.mark.parametrize(("may_miss", "offset_share"), [(0.45, 0.6), (0.25, 0.8), (0.001, 1.0)])
-def test_the_adviser_uses_as_little_of_the_band_as_what_it_may_miss_allows(split, may_miss, offset_share) -> None:
-    """With a share s of the band it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
-    bands = Calibration(
-        level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.1, 0.0, 0.0, 0.0), anatomies=3, intervals=30,
-        dataset="", offset_share=1.0, longest_s=45.0,
-    )  # fmt: skip
-    config = replace(EVENTS, missed=may_miss)
-    assert monitoring.least_offset_share(approaching(split, half=0.1), bands, config) == offset_share
+BANDS = Calibration(
+    level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
+    offset_share=1.0, longest_s=45.0,
+)  # fmt: skip
 
 
-def test_no_share_of_the_band_beyond_the_first_that_misses_too_much_is_chosen(split, monkeypatch) -> None:
-    missed = iter([0.01, 0.02, 0.06, *[0.01] * len(monitoring.OFFSET_SHARES)])
-    monkeypatch.setattr(monitoring, "surely_missed", lambda *_: next(missed))
-    bands = Calibration(
-        level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
-        offset_share=1.0, longest_s=45.0,
-    )  # fmt: skip
-    assert monitoring.least_offset_share(approaching(split, half=0.1), bands, EVENTS) == monitoring.OFFSET_SHARES[1]
+@pytest.mark.parametrize(("missed", "share"), [([0, 0, 0, 0, 0], 0.0), ([0, 1, 5, 0, 0], 0.75), ([9] * 5, 1.0)])
+def test_as_little_of_the_band_is_used_as_what_may_be_missed_allows(missed, share) -> None:
+    """No share beyond the first that misses too much is chosen; patients are alike, so that no error is added."""
+    of = dict(zip(monitoring.OFFSET_SHARES, missed, strict=True))
+    tried = list[float]()
+
+    def measured(bands: Calibration) -> list[Followed]:
+        tried.append(bands.offset_share)
+        return [followed(name, np.zeros((20, 2)), missed=of[bands.offset_share]) for name in "abc"]
+
+    least, curve = monitoring.least_offset_share(measured, BANDS, 0.25)
+    assert least == share and [each["offset_share"] for each in curve] == tried
+    assert tried == list(monitoring.OFFSET_SHARES)[: len(tried)]
 
 
-def test_the_adviser_asks_for_more_where_exposures_show_that_the_model_errs(split) -> None:
-    """Bands of ±0.3 mm that never grow ask for X-ray after `longest_s` alone, and the tip drifts by 0.6 mm/s."""
-    bands = Calibration(
-        level=0.9, scale=1.0, abscissa_terms=(0.3, 0, 0, 0), offset_terms=(0.3, 0, 0, 0), anatomies=3, intervals=30,
-        dataset="", offset_share=0.0, longest_s=3.0,
-    )  # fmt: skip
-    never_at_the_wall = replace(EVENTS, wall_ratio=50.0, abscissa_mm=9.0)
-    asked = []
-    for drift_mm in (0.0, 0.3):
-        tip = np.stack([split.episodes.proximal[..., 0], np.full(split.found.shape, 0.4)], axis=-1)
-        tip[:, WINDOW:, 0] -= drift_mm * np.arange(1, tip.shape[1] - WINDOW + 1)
-        episodes = replace(split.episodes, tip=tip, tip_sd=np.full(tip.shape, 0.05))
-        drifting = replace(split, episodes=episodes, model=online_predictor(HoldSlack(), episodes))
-        policy = monitoring.adviser_policy(drifting, bands, never_at_the_wall)
-        asked.append(monitoring.follow_policy(drifting, policy, never_at_the_wall).exposed.sum(axis=1))
-    assert (asked[0] == 3).all() and (asked[1] > 3).all()  # in 10 s
-
-
-def test_simulated_wires_are_weighted_by_what_is_observed(split) -> None:
-    samples, count = split.truth.shape[1], len(split.truth)
-    slack = np.array([0.0, 1.0, 2.0])[:, None, None] * (np.arange(samples) >= WINDOW)
-    paths = np.stack([np.broadcast_to(20.0 - slack, (3, count, samples)), np.full((3, count, samples), 0.5)], axis=-1)
-    given = replace(split.episodes, tip=np.tile([20.0, 0.5], (count, samples, 1)))
-
-    class Parting(SimulatedWires):
-        def paths(self, episodes, seen):
-            return paths
-
-    model = OnlineWires(Parting(), given, split.found)
-    assert (model.tip[:, WINDOW:, 0] == 19.0).all()  # all alike so far: the middle one
-    assert model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3))
-    model.observe(np.array([0]), 33, np.array([[18.0, 0.5]]), np.array([0]))
-    assert (model.tip[0, 34:, 0] == 18.0).all() and (model.tip[0, WINDOW:34, 0] == 19.0).all()
-    assert (model.tip[1:, WINDOW:, 0] == 19.0).all()
-    assert model.spread[0, -1, 0] < 0.2
-    model.reset()
-    unsure = np.array([[50.0, 50.0]])  # the detector's own standard deviations
-    model.observe(np.array([0]), 33, np.array([[18.0, 0.5]]), np.array([0]), unsure)
-    assert (model.tip[0, 34:, 0] == 19.0).all() and model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3), rel=1e-2)
-
-
-def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -> None:
+def test_the_command_calibrates_measures_and_draws(folder, tmp_path, capsys) -> None:
+    make_toy_dataset(tmp_path / "other", **SHAPE, anatomy_shares=SHARES, friction=(0.3, 0.3))
+    make_toy_dataset(tmp_path / "all", **SHAPE, anatomy_shares=(0.0, 0.0, 1.0))
     run, dataset, output = folder / "run", folder / "dataset", folder / "out"
+    others = [str(dataset), str(tmp_path / "other")]
     with pytest.raises(SystemExit) as leave:
-        main(["advise", str(run), str(dataset), "-o", str(output), "--abscissa-mm", "0.8"])
+        main(["advise", str(run), str(dataset), "-o", str(output), "--level", "0.5", "--also-test", *others])
     assert leave.value.code == 0
     printed = capsys.readouterr().out
     assert "missed_share" in printed and "exposures_per_minute" in printed
     figures = json.loads((output / "advice.json").read_text(encoding="utf-8"))
     assert Calibration.read(run).scale == figures["calibration"]["scale"] > 0
-    assert figures["calibration"]["anatomies"] == 10 and figures["coverage"]["patients"] == 1
-    assert 0 <= figures["coverage"]["simultaneous"] <= figures["coverage"]["samplewise"] <= 1
+    assert figures["calibration"]["anatomies"] == 2 and figures["coverage"]["patients"] == 1
+    assert 0 <= figures["coverage"]["simultaneous"] <= 1 and 0 <= figures["coverage"]["samplewise"] <= 1
     assert (output / "advice.png").stat().st_size > 10_000
-    widest = figures["curves"]["adviser"][-1]
-    assert widest["offset_share"] == 2.5 and figures["curves"]["adviser"][0]["offset_share"] == 0.0
-    offset_share = figures["calibration"]["offset_share"]
-    assert figures["adviser"]["offset_share"] == offset_share == Calibration.read(run).offset_share
+    assert figures["adviser"]["offset_share"] == figures["calibration"]["offset_share"]
+    same, other = figures["made_otherwise"]
+    assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
+    assert same["coverage"] == figures["coverage"] and same["adviser"].items() <= figures["adviser"].items()
+    with pytest.raises(InputError, match="which the bands are fitted to"):
+        advise(
+            run, dataset, tmp_path / "no", AdviseConfig(adviser=AdviserConfig(level=0.5)), also_test=[tmp_path / "all"]
+        )
+    assert not (tmp_path / "no").exists()
 
 
-def test_the_calibration_of_simulated_wires_goes_to_the_output(
-    folder, split, hold_slack, tmp_path, monkeypatch
-) -> None:
-    monkeypatch.setattr(monitoring, "monitor", lambda *_, **__: split)
-    monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
-    monkeypatch.setattr(advise_module, "SHARES", ())
-    found = advise(Path("wires"), folder / "dataset", tmp_path / "out", AdviseConfig())
-    assert Calibration.read(tmp_path / "out") == found["calibration"]
-    assert not Path("wires").exists()
+def test_too_few_patients_another_wire_or_no_run_leave_nothing_behind(folder, tmp_path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="needs at least 9 patients"):
+        advise(folder / "run", folder / "dataset", out, AdviseConfig())
     with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
-        advise(tmp_path / "no-run", folder / "dataset", tmp_path / "out", AdviseConfig())
-
-
-def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slack, tmp_path) -> None:
-    config = AdviseConfig(adviser=AdviserConfig(level=0.95))
-    with pytest.raises(InputError, match="needs at least 19 patients"):
-        advise(folder / "run", folder / "dataset", tmp_path / "out", config)
-    record = {"config": {}, "networks": {}, "device": asdict(read_wire("j-035"))}
+        advise(tmp_path / "no-run", folder / "dataset", out, AdviseConfig())
+    record = {"config": {}, "networks": {}, "patients": [], "device": asdict(read_wire("j-035"))}
     write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
-        advise(tmp_path, folder / "dataset", tmp_path / "out", AdviseConfig())
-    assert not (tmp_path / "out").exists() and not (tmp_path / "xray.json").exists()
+        advise(tmp_path, folder / "dataset", out, AdviseConfig())
+    shutil.copytree(folder, tmp_path / "pairs")
+    manifest = tmp_path / "pairs/dataset/meta/manifest.json"
+    write_json(manifest, read_json(manifest) | {"catheters": [asdict(read_catheter("microcatheter-1.7f"))]})
+    with pytest.raises(InputError, match=r"its wire lies in microcatheter-1\.7f; make it without --catheter for wires"):
+        advise(Path("wires"), tmp_path / "pairs/dataset", out, AdviseConfig())
+    assert not out.exists() and not (tmp_path / "xray.json").exists()
 
 
-def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
-    folder, split, hold_slack, tmp_path, monkeypatch
-) -> None:
-    shape = {"patients": 12, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
-    shares = (1 / 12, 10 / 12, 1 / 12)
-    make_toy_dataset(tmp_path / "other", **shape, anatomy_shares=shares, friction=(0.3, 0.3))
-    make_toy_dataset(tmp_path / "all", **shape, anatomy_shares=(0.0, 0.0, 1.0))
-    monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
-    monkeypatch.setattr(advise_module, "SHARES", ())
-    run, dataset, output = folder / "run", folder / "dataset", tmp_path / "out"
-    found = advise(run, dataset, output, AdviseConfig(), also_test=[dataset, tmp_path / "other"])
-    same, other = found["made_otherwise"]
-    assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
-    assert same["coverage"] == found["coverage"] and same["adviser"] == {
-        name: value for name, value in found["adviser"].items() if name != "offset_share"
-    }
-    assert other["coverage"]["patients"] == 1
-    dose, even = (other[name]["exposures_per_minute"] for name in ("adviser", "metronome"))
-    assert even == pytest.approx(dose, rel=0.3)
-    with pytest.raises(InputError, match="which the bands are fitted to"):
-        advise(run, dataset, tmp_path / "no", AdviseConfig(), also_test=[tmp_path / "all"])
-    assert not (tmp_path / "no").exists()
+def test_simulated_wires_are_followed_by_the_belief_of_the_agent(fork, tmp_path) -> None:
+    """A deeper ostium is identified from the first 15 s, and the tip then known without X-ray."""
+    wire = read_wire("workhorse-014")
+    config = DatasetConfig(sequences=1, seconds=18.0, seed=3, seen_test_share=0.0)
+    write_anatomy(fork, output=tmp_path / "fork")
+    generate_dataset([tmp_path / "fork"], output=tmp_path / "d", device=wire, config=config, world=World(ostium_mm=2.5))
+    (followed_by,) = Patient(read_dataset(tmp_path / "d"), AdviseConfig()).navigations
+    monitor = Monitor(
+        followed_by, replace(BANDS, scale=0.2, abscissa_terms=(1.0, 0, 0, 0), offset_terms=(1.0, 0, 0, 0))
+    )
+    found = Patient(read_dataset(tmp_path / "d"), AdviseConfig()).follow(0, monitor, asked=False)
+    assert monitor.identified is not None and monitor.belief.mean_ostium_mm == pytest.approx(2.5, abs=0.7)
+    assert found.error[:, 0].mean() < 1.0

@@ -21,7 +21,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, Observed, OpenLoop
+from endopilot.models.episodes import Episodes, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulate import simulate
@@ -124,7 +124,7 @@ class Toy:
         tip = np.stack([SLACK * proximal[..., 0], np.full(proximal.shape[:2], 0.5)], axis=-1)
         return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
 
-    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Episodes) -> OpenLoop:
         wanted = episodes.tip[:, WINDOW:, 0] / SLACK
         before = np.concatenate([episodes.proximal[:, WINDOW - 1 : WINDOW, 0], wanted[:, :-1]], axis=1)
         control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)
@@ -138,7 +138,7 @@ class Toy:
 def run(found, tmp_path, monkeypatch):
     from dataclasses import asdict
 
-    record = {"config": {}, "networks": {}, "device": asdict(found.navigation.device)}
+    record = {"config": {}, "networks": {}, "patients": [], "device": asdict(found.navigation.device)}
     write_json(tmp_path / "run" / "manifest.json", record)
     monkeypatch.setattr(network_plan, "load_model", lambda _: Toy())
     return tmp_path / "run"

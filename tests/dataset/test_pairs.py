@@ -146,7 +146,7 @@ def test_models_take_it_with_the_commands_of_both_devices(pairs):
     episodes = Episodes.of_dataset(replace(data, **longer))
     np.testing.assert_array_equal(episodes.command, np.repeat(data.command, 2, axis=1))
     np.testing.assert_array_equal(episodes.start, data.initial)
-    assert episodes.setup.device == Stack(WIRE, (WEAK,))
+    assert episodes.device == Stack(WIRE, (WEAK,))
     check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 

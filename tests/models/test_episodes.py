@@ -9,8 +9,7 @@ import pytest
 
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
-from endopilot.models.episodes import Episodes, EpisodeSetUp
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.models.episodes import Episodes
 from toy_navigation import make_toy_dataset
 
 
@@ -24,43 +23,33 @@ def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     asked = dataset.control + np.stack([slip, np.zeros_like(slip)], axis=-1) / dataset.sample_period_s
     slipped = replace(dataset, slip=slip, command=asked.astype(float) + 1e-9)  # with digits that float32 lacks
     episodes = Episodes.of_dataset(slipped)
-    assert len(episodes) == len(dataset) and episodes.samples == 120
+    assert len(episodes) == len(dataset) and episodes.tip.shape[1] == 120
     np.testing.assert_array_equal(episodes.proximal[..., 0], dataset.inserted_length[:, :, 0])
     np.testing.assert_array_equal(episodes.proximal[..., 1], dataset.rotation[:, :, 0])
     np.testing.assert_array_equal(episodes.tip[..., 0], dataset.tip_abscissa[:, :, 0])
     np.testing.assert_array_equal(episodes.tip[..., 1], dataset.tip_offset[:, :, 0])
-    np.testing.assert_array_equal(episodes.initial, dataset.initial[:, 0])
     np.testing.assert_array_equal(episodes.command, slipped.command)
     np.testing.assert_array_equal(episodes.start, dataset.initial)
     assert np.abs(episodes.command[:, :, 0] - episodes.control).max() > 1.0
     names = set(dataset.anatomy.tolist())
-    assert names == set(episodes.setup.anatomies)
-    assert all(episodes.setup.anatomies[name]().name == name for name in names)
+    assert names == set(episodes.anatomies)
+    assert all(episodes.anatomies[name]().name == name for name in names)
 
 
-def test_chosen_episodes_share_the_setup(dataset):
+def test_chosen_episodes_share_the_vessels(dataset):
     episodes = Episodes.of_dataset(dataset)
     some = episodes.select(np.array([3, 1]))
-    assert some.setup is episodes.setup and some.anatomy.tolist() == [episodes.anatomy[3], episodes.anatomy[1]]
-    np.testing.assert_array_equal(some.branch, episodes.branch[[3, 1]])
-
-
-def test_episodes_from_a_sample_on_begin_at_the_state_before_it(dataset):
-    episodes = Episodes.of_dataset(dataset)
-    later = episodes.from_sample(40)
-    np.testing.assert_array_equal(later.initial, episodes.proximal[:, 39])
-    for name in ("control", "command", "proximal", "tip", "branch", "tip_sd"):
-        np.testing.assert_array_equal(getattr(later, name), getattr(episodes, name)[:, 40:])
-    assert episodes.from_sample(0) is episodes
+    assert some.anatomies is episodes.anatomies and some.anatomy.tolist() == [episodes.anatomy[3], episodes.anatomy[1]]
+    np.testing.assert_array_equal(some.tip, episodes.tip[[3, 1]])
 
 
 def test_planned_controls_are_made_exactly(fork, wire):
     control = np.random.default_rng(0).normal(size=(2, 5, 2))
-    setup = EpisodeSetUp.of_anatomy(fork, wire, SimulatorConfig())
-    episodes = Episodes.of_controls(setup, initial=np.array([2.0, 0.5]), control=control, tip=np.zeros((2, 5, 2)))
+    given = {"initial": np.array([2.0, 0.5]), "control": control, "tip": np.zeros((2, 5, 2))}
+    episodes = Episodes.of_controls(fork, wire, **given)
     np.testing.assert_allclose(episodes.proximal[:, -1], [2.0, 0.5] + 0.5 * control.sum(axis=1))
     np.testing.assert_array_equal(episodes.command[:, :, 0], control)
-    assert episodes.anatomy.tolist() == [fork.name] * 2 and episodes.setup.anatomies[fork.name]() is fork
+    assert episodes.anatomy.tolist() == [fork.name] * 2 and episodes.anatomies[fork.name]() is fork
 
 
 def test_episodes_no_longer_than_the_given_states_are_refused(tmp_path):

@@ -24,12 +24,6 @@ def random_window(batch: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
     return 20 + motion.cumsum(1), 22 + motion.cumsum(1), torch.randn(batch, WINDOW, 2, generator=generator)
 
 
-def test_size_is_the_paper_s():
-    size = TransformerConfig()
-    assert (WINDOW, size.heads, size.encoder_layers, size.decoder_layers) == (30, 12, 4, 4)
-    assert (size.feedforward, size.dropout, size.d_model) == (128, 0.1, 96)
-
-
 def test_parameters_as_counted_by_hand(network):
     d, f, features, outputs = 96, 128, 9, 2
     attention = 4 * (d * d + d)  # query, key, value, output

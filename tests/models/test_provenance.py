@@ -57,13 +57,6 @@ def test_a_patient_is_known_in_another_dataset_too(own, elsewhere, record):
     assert known == set(own.anatomy[own.split == "train"].tolist())
 
 
-def test_an_older_run_knows_its_own_dataset_alone(own, elsewhere, record):
-    old = {key: value for key, value in record.items() if key != "patients"}
-    assert trained_patients(RUN, old, own) == set(own.anatomy[own.split == "train"].tolist())
-    with pytest.raises(InputError, match=r"does not name the patients that it was trained on.*train it again"):
-        trained_patients(RUN, old, elsewhere)
-
-
 def test_simulated_wires_know_nobody_and_take_any_wire(own):
     other = replace(own, manifest=own.manifest | {"device": asdict(read_wire("j-035"))})
     assert trained_patients(RUN, read_run(WIRES), other) == frozenset()

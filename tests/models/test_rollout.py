@@ -57,14 +57,6 @@ def changed(episodes, value, samples, *names):
     return replace(episodes, **copies)
 
 
-def test_shapes(episodes):
-    predictor = untrained()
-    for rollout in (predictor.rollout_forward, predictor.rollout_inverse, predictor.rollout_dual):
-        result = rollout(episodes)
-        assert result.tip.shape == result.proximal.shape == result.control.shape == (16, 90, 2)
-        assert all(np.isfinite(signal).all() for signal in (result.tip, result.proximal, result.control))
-
-
 def test_forward_reads_no_tip_after_the_given_ones(episodes):
     blind = changed(episodes, np.nan, slice(GIVEN, None), "tip")
     predictor = untrained()
@@ -113,25 +105,6 @@ def test_dual_feeds_the_predicted_tip_back(episodes):
         proximal=np.concatenate([episodes.proximal[:, :GIVEN], dual.proximal], axis=1),
     )
     np.testing.assert_allclose(predictor.rollout_forward(along).tip, dual.tip, atol=1e-3)
-
-
-def test_a_plan_under_way_takes_the_last_thirty_states(episodes):
-    predictor, now = untrained(), 69
-    observed = np.arange(120) < GIVEN
-    observed[now] = True
-    plan = predictor.rollout_dual(episodes, observed)
-    assert plan.control.shape == (len(episodes), 120 - now - 1, 2)
-    start = episodes.proximal[:, now].astype(float)
-    np.testing.assert_allclose(plan.proximal[:, 0], start + 0.5 * plan.control[:, 0], atol=1e-9)
-
-    def planned(episodes):
-        return predictor.rollout_dual(episodes, observed).control
-
-    before_the_window = changed(episodes, np.nan, slice(0, now - 29), "tip")
-    np.testing.assert_array_equal(planned(before_the_window), plan.control)
-    elsewhere = changed(episodes, episodes.tip[:, now] + 1.0, now, "tip")
-    assert np.abs(planned(elsewhere) - plan.control).max() > 1e-3
-    np.testing.assert_array_equal(planned(changed(episodes, np.nan, slice(now + 1, None), "control")), plan.control)
 
 
 def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(episodes):

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.belief.drives import Drives, force_sd_n
-from endopilot.belief.moved_copies import Fans, MovedCopies, shifted, turned
+from endopilot.belief.moved_copies import SIDES, MovedCopies, shifted, turn_to_all_sides, turned
 from endopilot.belief.thought import Budget
 from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.device import lateral_reach
@@ -181,7 +181,7 @@ class Belief:
         self.ostium_mm = np.array([each.ostium_mm for each in self.members])
         self.vessels = vessels or SharedVessels(navigation.anatomy)
         self.kinds, self.kind = self.vessels.kinds(navigation.stack, self.members, budget)
-        self._fans = Fans(self.kinds, self.navigation.known_motion, self._core)
+        self._fans = dict[int, Simulator]()
         self.error, self.force = np.zeros((len(self.members), 2)), np.zeros(len(self.members))
         self._error_sd = self.error
         self._score, self._coaxial = np.zeros(len(self.members)), bool(navigation.catheters)
@@ -446,16 +446,14 @@ class Belief:
         self._error_sd = _sds(axes, measured)
         return self.explains
 
+    def _worlds_of(self, kind: int, count: int) -> Simulator:
+        """Return a simulator of so many worlds of a kind, for copies of its members."""
+        known, shared = self.navigation.known_motion, [self.simulator]
+        return Simulator(*self.kinds[kind], worlds=count, motion=known, config=self._core, sharing=shared)
+
     @cached_property
     def _copies(self) -> MovedCopies:
-        return MovedCopies(
-            self.kinds[0],
-            self.config.copies,
-            limits=self._limits,
-            motion=self.navigation.known_motion,
-            config=self._core,
-            sharing=self.simulator,
-        )
+        return MovedCopies(self._worlds_of(0, self.config.copies), self._limits)
 
     def play_spread(self) -> Float[np.ndarray, "2"]:
         """Return the standard deviations of (Δtip, γtip) that the plays of the wire's drive make, mm."""
@@ -468,7 +466,13 @@ class Belief:
         """Update where the wire's proximal end is believed; return how far the likeliest tip moves by that, mm."""
         best, drives = self.best, self.drives
         before = drives.proximal[0].copy()
-        fan = self._fans.of(int(self.kind[best]), best, self.simulator) if drives.sd[0, 1] > _SURE_RAD else None
+        fan = None
+        if drives.sd[0, 1] > _SURE_RAD:
+            kind = int(self.kind[best])
+            if kind not in self._fans:
+                self._fans[kind] = self._worlds_of(kind, SIDES)
+            fan = self._fans[kind]
+            turn_to_all_sides(fan, best, self.simulator)
         place = self.navigation.anatomy, int(self.tip.branch[best]), float(self.tip.abscissa[best])
         left = drives.samples(0) - before
         tip, along = turned(self.simulator, best, left[:, 1], fan)

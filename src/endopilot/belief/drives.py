@@ -46,6 +46,20 @@ _LEAST_LIKELY = 0.02
 """No force makes a sample less likely than this, as a share of the most likely: simulated devices may be elsewhere."""
 _MOVES_MM_S, _TURNS_RAD_S = 0.5, 0.1
 """A motor says something by its force that advances faster than this, mm/s, and turns its device no faster, rad/s."""
+
+
+def ahead_of_valve_n(load: Proximals, commanded: Proximals, valve: tuple[float, float]) -> float | None:
+    """Return the force that the wire's drive reads, N, less the valve's; None where none is measured, or where the wire
+    advances so slowly that the valve's friction hides it.
+
+    Args:
+        valve: friction of the introducer's valve, N, and its drag, N·s/mm.
+    """
+    if not load or not commanded or commanded[0][0] < _MOVES_MM_S:
+        return None
+    return load[0][0] - valve[0] - valve[1] * commanded[0][0]
+
+
 _TAKEN_UP = np.array([0.05, 0.03])
 """What is left of a play that counts as taken up, mm and rad."""
 _WORTH_IT = np.array([0.3, 0.1])

@@ -14,19 +14,6 @@ from jaxtyping import Bool, Float
 from endopilot.types import VesselTree
 
 
-def near_exposures(exposed: Bool[np.ndarray, "*n samples"], *, before: bool = False) -> Bool[np.ndarray, "*n samples"]:
-    """Return which samples have an exposure then or 0.5 s, a sample, later, given which were exposed.
-
-    Args:
-        before: whether one that comes a sample earlier counts too, as in version 2 of the ladder.
-    """
-    near = exposed.copy()
-    near[..., :-1] |= exposed[..., 1:]
-    if before:
-        near[..., 1:] |= exposed[..., :-1]
-    return near
-
-
 def astray_mm(
     tree: VesselTree, believed: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]
 ) -> Float[np.ndarray, "n"]:
@@ -67,9 +54,11 @@ def count_events(
     Args:
         state: whether the tip is at the wall, astray, or pressed too hard.
         exposed: which samples have an exposure; the first is of the start, which even ones have too.
-        before: see `near_exposures`.
+        before: whether one that comes a sample earlier shows it too, as in version 2 of the ladder.
     """
-    begins, near = state[..., 1:-1] & ~state[..., :-2], near_exposures(exposed, before=before)
+    begins, near = state[..., 1:-1] & ~state[..., :-2], exposed[..., 1:-1] | exposed[..., 2:]
+    if before:
+        near = near | exposed[..., :-2]
     happened, shows = int(begins.sum()), 3 if before else 2
     evenly = happened * max(0.0, 1.0 - shows * float(exposed[..., 1:].mean()))
-    return Counted(happened, int((begins & ~near[..., 1:-1]).sum()), evenly)
+    return Counted(happened, int((begins & ~near).sum()), evenly)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.belief.belief import Belief, Past
-from endopilot.belief.drives import UNKNOWN, force_sd_n
+from endopilot.belief.drives import UNKNOWN, ahead_of_valve_n, force_sd_n
 from endopilot.belief.patient_motion import FoundMotion, find_motion
 from endopilot.errors import InputError
 from endopilot.models.hypotheses import HEART, HYPOTHESES, LUMEN, Family, Posterior
@@ -28,8 +28,6 @@ _LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
 """A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
 _LARGEST_MAP = 50_000_000
 """Points of a distance map beyond which no other lumen is tried: it would take gigabytes."""
-_ADVANCES_MM_S = 0.5
-"""A slower advance says nothing by its force: the valve's friction hides it."""
 _MODEL_MM = np.array([0.5, 0.3])
 """Standard deviations of a good member's errors along and across its wire, mm."""
 _DEVIATIONS = 1.28
@@ -95,16 +93,14 @@ def identify(belief: Belief, past: Past) -> tuple[Belief, Identified]:
 def _advances(belief: Belief, past: Past) -> list[tuple[list[int], float]]:
     """Return the periods before each exposure, since the last one, in which the wire advanced, and with what force in
     the mean, N, less the valve's; none where drives lose their motion, or measure no force: it is 0 then."""
-    friction_n, drag_n_s_mm = belief.valve
     found, begun = [], 1
     for exposed in past.exposures:
-        periods, read = [], []
+        read = dict[int, float]()
         for period in range(begun, exposed + 1):
-            _, load, commanded = past.measured[period]
-            if load and commanded and commanded[0][0] > _ADVANCES_MM_S and not belief.drives.lose:
-                periods.append(period)
-                read.append(load[0][0] - friction_n - drag_n_s_mm * commanded[0][0])
-        found.append((periods, float(np.mean(read)) if read else 0.0))
+            pushed_n = ahead_of_valve_n(*past.measured[period][1:], belief.valve)
+            if pushed_n is not None and not belief.drives.lose:
+                read[period] = pushed_n
+        found.append((list(read), float(np.mean(list(read.values()))) if read else 0.0))
         begun = exposed + 1
     return found
 

@@ -15,6 +15,7 @@ import numpy as np
 from endopilot.belief.adviser import AdviserConfig, Predicted
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig, Past
+from endopilot.belief.drives import ahead_of_valve_n
 from endopilot.belief.identification import BETTER, Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import SEEKS, Event, States
@@ -26,8 +27,8 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 _FORGETS, _PRIOR_N = 0.9, 0.1
 """What a period weighs a period later; and with what force the prior, that the drive pushes as predicted, counts, N."""
-_LEAST_N, _LEAST_MM_S = 0.02, 0.5
-"""A predicted force of less, or a slower advance, says nothing: noise and the valve's friction hide it."""
+_LEAST_N = 0.02
+"""A predicted force of less says nothing: noise hides it."""
 _MARGIN = 0.25
 """A ratio is believed this much smaller than it is found: by so much it errs where the model is right, found on
 patients to improve agents on."""
@@ -49,30 +50,13 @@ class LoadRatio:
         self._read = self._predicted = _PRIOR_N**2
         self._off = list[float]()
 
-    def take(
-        self,
-        read_n: float,
-        predicted_n: float,
-        *,
-        speed_mm_s: float,
-        valve: tuple[float, float],
-        sd_n: float = np.inf,
-    ) -> None:
-        """Take a reading.
-
-        Args:
-            read_n: force that the drive reads, N.
-            predicted_n: what the wire ahead of the valve takes of it by the model, N.
-            speed_mm_s: at which the drive advanced, mm/s.
-            valve: friction of the introducer's valve, N, and its drag, N·s/mm.
-            sd_n: standard deviation of that prediction, N; nothing lies outside its band if not given.
-        """
-        if speed_mm_s < _LEAST_MM_S:
-            return
-        pushed_n, prior = read_n - valve[0] - valve[1] * speed_mm_s, (1 - _FORGETS) * _PRIOR_N**2
+    def take(self, pushed_n: float, predicted_n: float, sd_n: float = np.inf) -> None:
+        """Take a reading while the wire advances: the force ahead of the valve, N, what the model predicts of it, and
+        the standard deviation of that, N; nothing lies outside its band if not given."""
         self._off.append((pushed_n - predicted_n) / sd_n)
         if predicted_n < _LEAST_N:
             return
+        prior = (1 - _FORGETS) * _PRIOR_N**2
         self._read = _FORGETS * self._read + predicted_n * pushed_n + prior
         self._predicted = _FORGETS * self._predicted + predicted_n**2 + prior
 
@@ -145,6 +129,7 @@ class Monitor:
         advice: AdviserConfig | None = None,
         members: Sequence[World] | None = None,
         pace: Pace | None = None,
+        settles: int = 0,
     ) -> None:
         """Lay out the simulated wires at the start of a navigation.
 
@@ -153,6 +138,8 @@ class Monitor:
                 neither asks for X-ray nor changes its belief.
             members: what the simulated wires take reality to be; around what is given if not given.
             pace: what each step grants the search for what explains the exposures; if not given, one waits for it all.
+            settles: exposures before another belief is sought, such as in a time under X-ray: all of them tell more
+                than the first few.
         """
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config) if members is None else tuple(members)
@@ -163,12 +150,17 @@ class Monitor:
         self.seen: TipMeasurement | None = None
         self._tests, self._loads = calibration is not None and not navigation.catheters, LoadRatio()
         self.changes_left, self._since, self._returned = _MOST, 0, False
-        self._pace, self._thought = pace or Pace(), None
+        self._pace, self._thought, self._settles, self._alarmed = pace or Pace(), None, settles, False
         self._watch, self._innovations = None, Innovations()
         if calibration is not None:
             tip_radius_mm, at = navigation.device.tip_radius_mm, predicted_tip(self.belief)
             self._watch = Watch(calibration, advice or AdviserConfig(), tip_radius_mm, at, alone=self._tests)
             self._innovations = self._watch.innovations
+
+    @property
+    def predicted(self) -> Predicted:
+        """What the belief predicts of the tip."""
+        return predicted_tip(self.belief)
 
     @property
     def lost(self) -> bool:
@@ -203,10 +195,10 @@ class Monitor:
         self.past.measured.append((encoders, load, commanded))
         if period:
             self.belief.follow(encoders, load)
-            if load and commanded and self._tests:
-                read_n, pushed_n, speed_mm_s = load[0][0], self.belief.pushed_n, commanded[0][0]
+            pushed_n = ahead_of_valve_n(load, commanded, self.belief.valve)
+            if pushed_n is not None and self._tests:
                 sd_n, before = np.inf if self.belief.drives.lose else self.belief.pushed_sd_n, self._loads.outside
-                self._loads.take(read_n, pushed_n, speed_mm_s=speed_mm_s, valve=self.belief.valve, sd_n=sd_n)
+                self._loads.take(pushed_n, self.belief.pushed_n, sd_n)
                 self._innovations.alarm |= self._loads.outside and not before
         else:
             self.belief.drives.begin(encoders)
@@ -247,9 +239,11 @@ class Monitor:
         self.belief.weigh(seen)
         self.sought = not self.belief.explains and self.belief.seek(seen)
         self._innovations.alarm |= self._tests and not self.belief.explains
-        self._since += 1
+        self._since, self._alarmed = self._since + 1, self._alarmed or self.alarm
+        if (shown := len(self.past.exposures)) == self._settles:
+            self._innovations.alarm |= self._alarmed
         seeks_motion, changes = self._may_move(), self._is_to_change()
-        if self._thought is None and (seeks_motion or changes):
+        if self._thought is None and shown >= self._settles and (seeks_motion or changes):
             self._thought = self._explaining(seeks_motion=seeks_motion, changes=changes)
 
     def _explaining(self, *, seeks_motion: bool, changes: bool) -> Thought[Explanation | None]:

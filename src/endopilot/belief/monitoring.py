@@ -1,4 +1,4 @@
-"""X-ray advice on new patients: do the bands hold, which events are missed, and how many exposures does it take?"""
+"""Recorded navigations that a model follows under X-ray: what it misses, calibrated (`calibrate`) and measured."""
 
 from __future__ import annotations
 
@@ -7,31 +7,32 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, Predicted
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
-from endopilot.belief.events import Counted, count_events, near_exposures
-from endopilot.belief.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
-from endopilot.belief.online_predictors import OnlinePredictor, online_predictor
-from endopilot.belief.watch import Watch
+from endopilot.belief.events import Counted, astray_mm, count_events
+from endopilot.belief.monitor import BelievedTip, Monitor
+from endopilot.belief.network_monitor import NetworkMonitor
 from endopilot.dataset.loader import Dataset
-from endopilot.devices.device import Wire
+from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, Predictor
 from endopilot.progress import progress
-from endopilot.settings import NonNegative, Seed, from_record, settings
-from endopilot.tasks.navigation import XrayKind
-from endopilot.types import SAMPLE_PERIOD_S, VesselTree
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+from endopilot.settings import NonNegative, Seed, settings
+from endopilot.simulation.motion import place, published_mean
+from endopilot.tasks.navigation import Navigation, Target, XrayKind, is_safe
+from endopilot.types import SAMPLE_PERIOD_S
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
+from endopilot.xray.image_fluoroscope import NotRegistered
+from endopilot.xray.make_c_arm import make_c_arm
+from endopilot.xray.moving_patient import seen_in_episodes, turned
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
-OFFSET_SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
+OFFSET_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Shares of γtip's band that are tried when an adviser is calibrated."""
-ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
-"""From sample, predicted tip and its spread (mm), which navigations are exposed."""
 
 
 @settings
@@ -51,344 +52,292 @@ class AdviseConfig:
     """Seed of the detection errors, of the ostia, and of the patients' poses."""
 
 
-@dataclass(frozen=True, eq=False)
-class Monitored:
-    """The navigations of one split, as they are and as the model is given them.
-
-    Attributes:
-        truth: true (Δtip, γtip), mm.
-        ratio: true γtip/(lumen radius − wire radius).
-        episodes: Δ by the encoder, and tips as X-ray would show them.
-        found: at which samples X-ray would show a tip.
-        unregistered: names of the patients who could not be registered in X-ray images, and were left out.
-        lumen: radii of the lumen, to look up.
-    """
-
-    truth: Float[np.ndarray, "episodes samples 2"]
-    ratio: Float[np.ndarray, "episodes samples"]
-    episodes: Episodes
-    found: Bool[np.ndarray, "episodes samples"]
-    unregistered: tuple[str, ...]
-    model: OnlinePredictor
-    lumen: Lumen
-    wire_radius_mm: float
-    dataset: str
-
-    @property
-    def proximal(self) -> Float[np.ndarray, "episodes samples 2"]:
-        """(Δ mm, φ rad) by the encoder."""
-        return self.episodes.proximal.astype(float)
-
-    @property
-    def since(self) -> tuple[Float[np.ndarray, "episodes later"], Float[np.ndarray, "episodes later"]]:
-        """Time, s, and travel, mm, since the last of the given samples, at the samples after it."""
-        length = self.proximal[:, WINDOW - 1 :, 0]
-        travel = np.abs(np.diff(length, axis=1)).cumsum(axis=1)
-        return SAMPLE_PERIOD_S * np.arange(1, length.shape[1]) + 0 * travel, travel
-
-
-class Lumen:
-    """The lumen's radius at a predicted tip: on the path through the branch that it was last observed in."""
-
-    def __init__(self, trees: Sequence[VesselTree], owner: Int[np.ndarray, "episodes"]) -> None:
-        """Take the lines.
-
-        Args:
-            owner: of each episode, the index of its patient.
-        """
-        self._lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
-        self._owner = owner
-
-    def radius(
-        self, branch: Int[np.ndarray, "episodes"], abscissa_mm: Float[np.ndarray, "episodes"]
-    ) -> Float[np.ndarray, "episodes"]:
-        """Return the radius, mm, at a Δtip, mm, on the path through a branch."""
-        lines = [self._lines[k][along] for k, along in zip(self._owner.tolist(), branch.tolist(), strict=True)]
-        return np.array([np.interp(at, *line) for at, line in zip(np.nan_to_num(abscissa_mm), lines, strict=True)])
-
-
-def _onwards(tree: VesselTree, branch: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return abscissa and radius of the path through a branch that follows the widest child to an end."""
-    while children := tree.children(branch):
-        branch = max(children, key=lambda child: float(np.median(tree.branches[child].centerline.radius)))
-    line = tree.path(branch)
-    return line.abscissa, line.radius
-
-
-def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, samples: int | None = None) -> Monitored:
-    """Return the navigations of a split with an online predictor of their tips.
-
-    Args:
-        dataset: the navigations as they truly went; encoders and exposures err as its world says.
-        config: the C-arm, and the model mismatch.
-        samples: exposures of so many samples are needed, from the first on; of all if not given. Images take time.
-
-    Raises:
-        InputError: no patient of the split can be registered in X-ray images.
-    """
-    images: dict[str, Exposures] = {}
-    unregistered: tuple[str, ...] = ()
-    if config.xray == "images":
-        count = dataset.valid.shape[1] if samples is None else samples
-        settings = ImageSettings(config.fluoroscope, config.ostium_mm, config.seed, count)
-        images, unregistered = image_exposures(dataset, settings)
-        dataset = dataset[~np.isin(dataset.anatomy, unregistered)]
-    names, owner = np.unique(dataset.anatomy, return_inverse=True)
-    wire_radius = from_record(Wire, dataset.manifest["device"]).tip_radius_mm
-    world = dataset.world
-    deeper = np.array([deeper_ostium_mm(str(name), config.ostium_mm, config.seed) for name in names]) + world.ostium_mm
-    by_encoder = np.zeros((len(dataset), 2))
-    by_encoder[:, 0] = -deeper[owner]
-    true = Episodes.of_dataset(dataset)
-    proximal, trees = true.proximal + by_encoder[:, None], []
-    tip, branch = true.tip.astype(float), true.branch.copy()
-    sd_mm, found = np.zeros(tip.shape), np.ones(branch.shape, dtype=bool)
-    known_motions = dict(true.setup.known_motions)
-    with progress("Exposing", len(names)) as advance:
-        for index, name in enumerate(names):
-            anatomy = true.setup.anatomies[str(name)]()  # one at a time: a distance map takes memory
-            trees.append(anatomy.tree)
-            mine = np.flatnonzero(owner == index)
-            if config.xray == "images":
-                seen = images[str(name)]
-                tip[mine], branch[mine], sd_mm[mine], found[mine] = seen.tip, seen.branch, seen.sd_mm, seen.found
-                if seen.known_motion is not None:
-                    known_motions[str(name)] = seen.known_motion
-            else:
-                arm = Fluoroscope(
-                    anatomy, wire_radius, config=config.fluoroscope, registration_mm=world.registration_mm
-                )
-                shown = arm.expose_episodes(dataset[mine], proximal[mine, :, 0], config.seed)
-                tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
-            advance()
-    measured = {"proximal": proximal, "tip": tip, "branch": branch, "tip_sd": sd_mm}
-    setup = replace(true.setup, known_motions=known_motions)
-    episodes = replace(true, initial=true.initial + by_encoder, setup=setup, **measured)
-    return Monitored(
-        truth=true.tip.astype(float),
-        ratio=safety_ratio(dataset.tip_offset[:, :, 0], dataset.lumen_radius[:, :, 0], wire_radius).astype(float),
-        episodes=episodes,
-        found=found,
-        unregistered=unregistered,
-        model=online_predictor(predictor, episodes, found),
-        lumen=Lumen(trees, owner),
-        wire_radius_mm=wire_radius,
-        dataset=dataset.manifest["key"],
-    )
-
-
-def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calibration:
-    """Return the calibration of a model.
-
-    Args:
-        fitted: navigations that the terms of the spread are fitted to; they need be no calibration patients.
-        config: how many of the intervals the bands shall hold throughout, and how many events the adviser may miss.
-
-    Raises:
-        InputError: there are too few calibration patients for that level.
-    """
-    fitted.model.reset()
-    seconds, travel = fitted.since
-    error = (fitted.model.tip - fitted.truth)[:, WINDOW:]
-    terms = fit_spread(error, seconds, travel, fitted.model.spread[:, WINDOW:])
-    terms = narrowest(terms, _worst(fitted, terms), config.level)
-    score = _worst(own, terms).max(axis=1)
-    bands = Calibration(
-        level=config.level,
-        scale=conformal_scale(score, own.episodes.anatomy, config.level),
-        abscissa_terms=terms[0],
-        offset_terms=terms[1],
-        anatomies=len(np.unique(own.episodes.anatomy)),
-        intervals=len(score),
-        dataset=own.dataset,
-        offset_share=1.0,
-        longest_s=SAMPLE_PERIOD_S * (own.truth.shape[1] - WINDOW),
-    )
-    return replace(bands, offset_share=least_offset_share(own, bands, config))
-
-
-def least_offset_share(own: Monitored, bands: Calibration, config: AdviserConfig) -> float:
-    """Return the smallest share of γtip's band by which the adviser surely misses no more events than it may.
-
-    Events of Δtip are too few to find a share for: the adviser uses the whole of that band.
-
-    The shares of `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is
-    taken, so that chance among many shares favours none; 1, where even the whole band misses too many.
-    """
-    names, owner = np.unique(own.episodes.anatomy, return_inverse=True)
-    least = OFFSET_SHARES[0]
-    with progress("Using less of the bands", len(OFFSET_SHARES)) as advance:
-        for share in OFFSET_SHARES:
-            found = follow_policy(own, adviser_policy(own, replace(bands, offset_share=share), config), config)
-            counts = np.array([np.sum(found.count(owner == index), axis=0) for index in range(len(names))])
-            if surely_missed(counts[:, 1], counts[:, 0]) > config.missed:
-                break
-            least = share
-            advance()
-    return least
-
-
-def _worst(monitored: Monitored, terms: tuple[tuple[float, ...], tuple[float, ...]]) -> Float[np.ndarray, "episodes 2"]:
-    """Return the largest error over the spread in each interval, of Δtip and of γtip."""
-    monitored.model.reset()
-    spread = spread_of(terms, *monitored.since, monitored.model.spread[:, WINDOW:])
-    return np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:] / spread).max(axis=1)
-
-
-def coverage(monitored: Monitored, calibration: Calibration) -> dict[str, Any]:
-    """Return how often the bands hold: over whole intervals of 45 s, sample by sample, and in the worst patients."""
-    monitored.model.reset()
-    half = calibration.half_width(*monitored.since, monitored.model.spread[:, WINDOW:])
-    inside: np.ndarray = np.less_equal(np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:]), half)
-    whole: np.ndarray = np.asarray(inside.all(axis=(1, 2)))
-    anatomy = monitored.episodes.anatomy
-    each = np.sort([whole[anatomy == name].mean() for name in np.unique(anatomy)])
-    worst = each[: max(1, round(len(each) / 10))]
-    return {
-        "simultaneous": float(np.mean(each)),
-        "each_band": inside.all(axis=1).mean(axis=0).tolist(),
-        "worst_decile_of_patients": float(worst.mean()),
-        "samplewise": float(inside.all(axis=2).mean()),
-        "median_half_width_mm": np.median(half, axis=(0, 1)).tolist(),
-        "error_mae_mm": np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:]).mean(axis=(0, 1)).tolist(),
-        "intervals": len(whole),
-        "patients": len(each),
-    }
+Follower = Monitor | NetworkMonitor
+"""What follows a wire that somebody drives."""
+Follows = Callable[[Navigation, Calibration | None, AdviserConfig], Follower]
+"""Makes what follows the wire of a navigation; without a calibration it only predicts."""
+Rows = Float[np.ndarray, "samples 2"]
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Navigations in which a policy decided when X-ray is on, from the last given sample on.
+    """A navigation as it was followed: a row for the last given sample, and for each after it.
 
     Attributes:
-        shown: which have one that shows the tip.
-        astray: whether the predicted Δtip errs by δ.
+        patient: their name.
+        length_mm: Δ by the encoder.
+        true: (Δtip, γtip), mm.
+        predicted: the same, as predicted.
+        spread: the model's estimate of its own error, mm.
+        half_width: of the bands, mm; NaN without a calibration.
+        exposed: whether X-ray was on.
+        events: what X-ray must not miss, by name: that the tip comes to the wall, is astray, or is pressed too hard.
     """
 
-    exposed: Bool[np.ndarray, "episodes samples"]
-    shown: Bool[np.ndarray, "episodes samples"]
-    wall: Bool[np.ndarray, "episodes samples"]
-    astray: Bool[np.ndarray, "episodes samples"]
+    patient: str
+    length_mm: Float[np.ndarray, "samples"]
+    true: Rows
+    predicted: Rows
+    spread: Rows
+    half_width: Rows
+    exposed: Bool[np.ndarray, "samples"]
+    events: dict[str, Counted]
 
-    def count(self, episodes: Bool[np.ndarray, "episodes"] | slice = slice(None)) -> list[Counted]:
-        """Return the events at the wall and of Δtip."""
-        return [count_events(state[episodes], self.shown[episodes]) for state in (self.wall, self.astray)]
+    @property
+    def error(self) -> Rows:
+        """Size of the errors after the given samples, mm."""
+        return np.abs(self.predicted - self.true)[1:]
 
-
-def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> Followed:
-    """Let a policy decide when X-ray is on, and let the model observe what it shows."""
-    model, truth = monitored.model, monitored.truth
-    model.reset()
-    exposed = np.zeros(truth.shape[:2], dtype=bool)
-    episodes = monitored.episodes
-    for sample in range(WINDOW, truth.shape[1]):
-        exposed[:, sample] = policy(sample, model.tip[:, sample], model.spread[:, sample])
-        on = np.flatnonzero(exposed[:, sample] & monitored.found[:, sample])
-        if len(on):
-            seen = episodes.tip[on, sample], episodes.branch[on, sample], episodes.tip_sd[on, sample]
-            model.observe(on, sample, *seen)
-    wall = monitored.ratio >= config.wall_ratio
-    astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
-    astray[:, WINDOW - 1] = False
-    return Followed(*(part[:, WINDOW - 1 :] for part in (exposed, exposed & monitored.found, wall, astray)))
+    @property
+    def grown(self) -> tuple[Float[np.ndarray, "later"], Float[np.ndarray, "later"], Rows]:
+        """What a band without X-ray grows by after the given samples: time, s, travel, mm, and the model's spread."""
+        travel = np.abs(np.diff(self.length_mm)).cumsum()
+        return SAMPLE_PERIOD_S * np.arange(1.0, len(travel) + 1), travel, self.spread[1:]
 
 
-def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> dict[str, float]:
-    """Return what a policy costs and misses: see `follow_policy`."""
-    found = follow_policy(monitored, policy, config)
-    (wall_events, missed_wall, _), (abscissa_events, missed_abscissa, _) = found.count()
-    unseen = found.wall & ~near_exposures(found.shown)
-    exposed, unseen, wall = (part[:, 1:] for part in (found.exposed, unseen, found.wall))
-    minutes = exposed.size * SAMPLE_PERIOD_S / 60
-    events = wall_events + abscissa_events
-    rate = float(exposed.sum() / minutes)
+class Patient:
+    """A patient's recorded navigations, and the C-arm that shows them.
+
+    Attributes:
+        name: the patient's.
+        navigations: as a model is given them.
+    """
+
+    def __init__(self, data: Dataset, config: AdviseConfig) -> None:
+        """Take the navigations of one patient.
+
+        Raises:
+            NotRegistered: the patient cannot be registered in X-ray images.
+            InputError: the anatomy is missing or damaged.
+        """
+        self.name, self._config, self._sequence = str(data.anatomy[0]), config, data.sequence.tolist()
+        anatomy, world, motion = read_anatomy(data.anatomy_folder(self.name)), data.world, data.motion(self.name)
+        given = Navigation(
+            anatomy=anatomy,
+            device=data.stack.wire,
+            target=Target(branch=0, abscissa=float(anatomy.tree.branches[0].centerline.abscissa[0])),
+            known_motion=None if motion is None else published_mean(motion),
+            xray=config.xray,
+        )
+        seed = int(self._random(5).integers(2**31))
+        self._arm: Any = make_c_arm(given, config=config.fluoroscope, seed=seed)
+        if config.xray == "images" and motion is not None:
+            self._arm.known_motion = self._arm.measure_motion(motion, self._random(6))
+        self._world, known, ostium = world, self._arm.known_motion, np.asarray(anatomy.insertion.position)
+        self._moves = seen_in_episodes(motion, known, ostium, data.valid.shape[1], SAMPLE_PERIOD_S)
+        self._tree, self._true = anatomy.tree, data
+        self._shape = data.driven(anatomy=anatomy, record_shape=True).shape if config.xray == "images" else None
+        deeper_mm = world.ostium_mm + config.ostium_mm * float(self._random(4).uniform(-1.0, 1.0))
+        self._encoders = np.stack([data.inserted_length, data.rotation], axis=-1)[:, :, 0] - [deeper_mm, 0.0]
+        self.navigations = [
+            replace(
+                given,
+                start_inserted_length_mm=max(length - deeper_mm, 0.0),
+                start_rotation_rad=turn,
+                known_motion=known,
+            )
+            for length, turn in data.initial[:, 0].tolist()
+        ]
+
+    def _random(self, *purpose: int) -> np.random.Generator:
+        return np.random.default_rng([self._config.seed, *purpose, *self.name.encode()])
+
+    def _exposed(self, number: int, sample: int) -> TipMeasurement | None:
+        """Return what an exposure at a sample of a navigation shows; None where no wire is found."""
+        true, at, moves = self._true, (number, sample), self._moves
+        beside_mm = np.array(self._world.registered_mm(SAMPLE_PERIOD_S * (sample + 1)))
+
+        def seen(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+            return points + beside_mm if moves is None else place(moves[sample], points + beside_mm)
+
+        length, random = float(self._encoders[number, sample, 0]), self._random(3, self._sequence[number], sample)
+        if self._shape is not None:
+            return self._arm.measure(seen(self._shape[at]), length, random)
+        tip, heading = (each[at][0].astype(float) for each in (true.tip_position, true.tip_direction))
+        heading = heading if moves is None else turned(moves[sample], heading)
+        return self._arm.measure(seen(tip), heading, length, random)
+
+    def follow(self, number: int, follower: Follower, *, asked: bool) -> Followed:
+        """Follow a navigation: X-ray is on at the first `WINDOW` samples, and then as it is asked for, if `asked`."""
+        true, navigation, advice = self._true, self.navigations[number], self._config.adviser
+        if self._config.xray == "images":
+            self._arm.forget_wires()
+        follower.step(((navigation.start_inserted_length_mm, navigation.start_rotation_rad),))
+        believed, spread, exposures, on = list[BelievedTip](), list[np.ndarray](), list[tuple[bool, bool]](), True
+        for sample, (length, turn) in enumerate(self._encoders[number].tolist()):
+            seen = self._exposed(number, sample) if on else None
+            believed.append(follower.step(((length, turn),), (), seen))
+            spread.append(follower.predicted.spread)
+            exposures.append((on, seen is not None))
+            on = sample + 1 < WINDOW or (asked and bool(believed[-1].asks)) or (on and seen is None)
+        exposed, shown = np.array(exposures).T
+        branch, predicted = zip(*((each.branch, (each.abscissa, each.offset)) for each in believed), strict=True)
+        where, of_wire = np.array(predicted), (number, slice(None), 0)
+        abscissa, offset, radius = (
+            each[of_wire].astype(float) for each in (true.tip_abscissa, true.tip_offset, true.lumen_radius)
+        )
+        off = astray_mm(self._tree, (np.array(branch), where[:, 0]), (true.branch[of_wire], abscissa))
+        states = {
+            "wall": safety_ratio(offset, radius, navigation.device.tip_radius_mm) >= advice.wall_ratio,
+            "astray": off >= advice.abscissa_mm,
+            "force": ~is_safe(true.contact_force_max[number], navigation.force_limit_n),
+        }
+        rows = slice(WINDOW - 1, None)
+        return Followed(
+            patient=self.name,
+            length_mm=self._encoders[number, rows, 0],
+            true=np.stack([abscissa, offset], axis=-1)[rows],
+            predicted=where[rows],
+            spread=np.array(spread)[rows],
+            half_width=np.array([each.half_width for each in believed])[rows],
+            exposed=exposed[rows],
+            events={name: count_events(state[rows], shown[rows]) for name, state in states.items()},
+        )
+
+
+def follow_all(
+    data: Dataset, follows: Follows, config: AdviseConfig, calibration: Calibration | None = None
+) -> tuple[list[Followed], list[str]]:
+    """Follow all navigations of a split: without X-ray after the first `WINDOW` samples, or as a calibrated adviser
+    asks for it.
+
+    Returns:
+        The navigations, and the names of the patients who cannot be registered in X-ray images.
+
+    Raises:
+        InputError: no patient can be registered.
+    """
+    names, found, bad = np.unique(data.anatomy).tolist(), list[Followed](), dict[str, NotRegistered]()
+    with progress("Following", len(names)) as advance:
+        for name in names:
+            try:
+                patient = Patient(data[data.anatomy == name], config)
+            except NotRegistered as error:
+                bad[name] = error
+            else:
+                for number, navigation in enumerate(patient.navigations):
+                    follower = follows(navigation, calibration, config.adviser)
+                    found.append(patient.follow(number, follower, asked=calibration is not None))
+            advance(remark=name)
+    if not found:
+        first = next(iter(bad.values()))
+        raise InputError(f"{data.folder}: no patient of its split '{data.split[0]}' can be registered; first: {first}")
+    return found, list(bad)
+
+
+def calibrate(fitted: Sequence[Followed], own: Sequence[Followed], level: float, dataset: str) -> Calibration:
+    """Return the calibration of a model, by navigations that were followed without X-ray.
+
+    Args:
+        fitted: those that the terms of the spread are fitted to; they need be of no calibration patients.
+        own: those by which it is scaled.
+        level: share of the intervals that the bands shall hold throughout.
+        dataset: key of their dataset.
+
+    Raises:
+        InputError: there are too few calibration patients for that level.
+    """
+    seconds, travel, spread = (np.concatenate(column) for column in zip(*(each.grown for each in fitted), strict=True))
+    terms = fit_spread(np.concatenate([each.error for each in fitted]), seconds, travel, spread)
+
+    def worst(some: Sequence[Followed]) -> Float[np.ndarray, "navigations 2"]:
+        return np.array([(each.error / spread_of(terms, *each.grown)).max(axis=0) for each in some])
+
+    terms = narrowest(terms, worst(fitted), level)
+    owner = np.array([each.patient for each in own])
+    return Calibration(
+        level=level,
+        scale=conformal_scale(worst(own).max(axis=1), owner, level),
+        abscissa_terms=terms[0],
+        offset_terms=terms[1],
+        anatomies=len(np.unique(owner)),
+        intervals=len(own),
+        dataset=dataset,
+        offset_share=1.0,
+        longest_s=SAMPLE_PERIOD_S * len(own[0].error),
+    )
+
+
+def least_offset_share(
+    measured: Callable[[Calibration], Sequence[Followed]], bands: Calibration, missed: float
+) -> tuple[float, list[dict[str, float]]]:
+    """Return the smallest share of γtip's band by which the adviser surely misses no more than a share of the events.
+
+    Events of Δtip are too few to find a share for: the adviser uses the whole of that band. The shares of
+    `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is taken, so that
+    chance among many shares favours none; 1, where even the whole band misses too many.
+
+    Args:
+        measured: the calibration patients' navigations as they were followed with some bands.
+
+    Returns:
+        The share, and what was measured with each that was tried.
+    """
+    least, curve = OFFSET_SHARES[0], list[dict[str, float]]()
+    for share in OFFSET_SHARES:
+        found = measured(replace(bands, offset_share=share))
+        curve.append({"offset_share": share} | measure(found))
+        names = sorted({each.patient for each in found})
+        counts = np.array([counted([each for each in found if each.patient == name]) for name in names])
+        if surely_missed(counts[:, 1], counts[:, 0]) > missed:
+            break
+        least = share
+    return least, curve
+
+
+def counted(found: Sequence[Followed], kinds: Sequence[str] = ("wall", "astray", "force")) -> Float[np.ndarray, "3"]:
+    """Return how many events of some kinds there are, how many are missed, and how many as many exposures at even times
+    would miss."""
+    return np.sum([each.events[kind] for each in found for kind in kinds], axis=0)
+
+
+def measure(found: Sequence[Followed]) -> dict[str, float]:
+    """Return what an adviser costs and misses, beside as many exposures at even times."""
+    minutes = SAMPLE_PERIOD_S / 60 * sum(len(each.error) for each in found)
+    rate = sum(int(each.exposed[1:].sum()) for each in found) / minutes
+    events, missed, evenly = counted(found).tolist()
+    share = missed / max(events, 1)
+    shares = {}
+    for kind in ("wall", "astray", "force"):
+        happened, unseen, _ = counted(found, (kind,)).tolist()
+        shares |= {f"{kind}_events_per_minute": happened / minutes, f"missed_{kind}_share": unseen / max(happened, 1)}
     return {
         "exposures_per_minute": rate,
-        "missed_share": (missed_wall + missed_abscissa) / max(events, 1),
+        "missed_share": share,
+        "missed_evenly_share": evenly / max(events, 1),
         "events_per_minute": events / minutes,
-        "wall_events_per_minute": wall_events / minutes,
-        "missed_wall_share": missed_wall / max(wall_events, 1),
-        "missed_abscissa_share": missed_abscissa / max(abscissa_events, 1),
+        **shares,
         "fewer_frames_than_fluoroscopy": 1 - rate / (60 * FLUOROSCOPY_HZ),
-        "wall_samples_without_exposure_share": float(unseen.sum() / max(wall.sum(), 1)),
+        "periodic_exposures_per_minute_with_the_same_missed_share": periodic_per_minute(share),
     }
 
 
-def adviser_policy(monitored: Monitored, calibration: Calibration, config: AdviserConfig) -> ExposurePolicy:
-    """Return the adviser as an exposure policy: a `Watch` of each navigation, which tests the model by innovations."""
-    monitored.model.reset()
-    episodes, last = monitored.episodes, WINDOW - 1
-    branch = episodes.branch[:, last].astype(int)
-
-    def at(sample: int, tip: np.ndarray, spread: np.ndarray) -> list[Predicted]:
-        proximal, radius_mm = monitored.proximal[:, sample], monitored.lumen.radius(branch, tip[:, 0])
-        return [Predicted(*each) for each in zip(proximal, tip, spread, radius_mm.tolist(), strict=True)]
-
-    first = at(last, monitored.model.tip[:, last], monitored.model.spread[:, last])
-    watches = [Watch(calibration, config, monitored.wire_radius_mm, each, alone=False) for each in first]
-
-    def due(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        now = at(sample, tip, spread)
-        return np.array([watch.advise(each) for watch, each in zip(watches, now, strict=True)])
-
-    again = taken_again(monitored, due)
-
-    def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        on = again(sample, tip, spread)
-        shown = np.flatnonzero(on & monitored.found[:, sample]).tolist()
-        branch[shown] = episodes.branch[shown, sample]
-        seen = episodes.tip[:, sample].astype(float)
-        radius_mm = monitored.lumen.radius(branch, seen[:, 0])
-        for k in shown:
-            watches[k].compare(seen[k] - tip[k], tuple(episodes.tip_sd[k, sample].tolist()))
-            at = Predicted(monitored.proximal[k, sample], seen[k], spread[k], float(radius_mm[k]))
-            watches[k].exposed(float(seen[k, 1]), at)
-        return on
-
-    return decide
+def periodic_per_minute(missed_share: float) -> float:
+    """Return the exposures a minute at which even times miss that share: each shows what began in two samples."""
+    return 60 / SAMPLE_PERIOD_S * (1 - missed_share) / 2
 
 
-def taken_again(monitored: Monitored, policy: ExposurePolicy) -> ExposurePolicy:
-    """Return a policy that takes an image in which no wire is found again at the next sample."""
-    unseen = np.zeros(len(monitored.truth), dtype=bool)
-
-    def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        on = policy(sample, tip, spread) | unseen
-        unseen[:] = on & ~monitored.found[:, sample]
-        return on
-
-    return decide
-
-
-def periodic_policy(monitored: Monitored, period: int) -> ExposurePolicy:
-    """Return periodic imaging, each navigation with a phase of its own; `period` counts samples."""
-    phase = np.arange(len(monitored.truth))
-    return taken_again(monitored, lambda sample, tip, spread: (sample + phase) % period == 0)
-
-
-def measure_metronome(monitored: Monitored, per_minute: float, config: AdviserConfig) -> dict[str, float]:
-    """Return what periodic imaging with about as many exposures a minute misses: see `measure_policy`."""
-    period = max(1, round(60 / SAMPLE_PERIOD_S / max(per_minute, 1e-9)))
-    return measure_policy(monitored, periodic_policy(monitored, min(period, monitored.truth.shape[1])), config)
-
-
-def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy:
-    """Return a policy that knows the truth, and exposes where an event begins."""
-    wall = monitored.ratio >= config.wall_ratio
-    was_astray = np.zeros(len(monitored.truth), dtype=bool)
-
-    def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        astray = np.abs(tip[:, 0] - monitored.truth[:, sample, 0]) >= config.abscissa_mm
-        due = (wall[:, sample] & ~wall[:, sample - 1]) | (astray & ~was_astray)
-        was_astray[:] = astray
-        return due
-
-    return taken_again(monitored, decide)
-
-
-def periodic_equal(curve: Sequence[dict[str, float]], missed_share: float) -> float:
-    """Return the exposures a minute at which the missed share of periodic imaging is no larger, between its points."""
-    points = sorted((point["exposures_per_minute"], point["missed_share"]) for point in curve)
-    rate, missed = (np.array(column) for column in zip(*points, strict=True))
-    missed = np.minimum.accumulate(missed)  # np.interp needs it monotone
-    return float(np.interp(-missed_share, -missed, rate)) if missed_share < missed[0] else float(rate[0])
+def coverage(found: Sequence[Followed]) -> dict[str, Any]:
+    """Return how often the bands hold: over whole intervals without X-ray, sample by sample, and in the worst patients;
+    infinite ones hold nothing."""
+    held, whole, owner = list[np.ndarray](), list[np.ndarray](), list[str]()
+    for each in found:
+        half, off = each.half_width[1:], ~each.exposed[1:]
+        inside, interval = np.less_equal(each.error, half) & np.isfinite(half), np.cumsum(each.exposed[1:])
+        numbers = np.unique(interval[off])
+        whole += [inside[off & (interval == number)].all(axis=0) for number in numbers]
+        owner += [each.patient] * len(numbers)
+        held.append(inside[off])
+    both, of = np.array(whole), np.array(owner)
+    throughout = np.asarray(both.all(axis=1))
+    patients = np.sort(np.array([throughout[of == name].mean() for name in set(owner)]))
+    return {
+        "simultaneous": float(throughout.mean()),
+        "each_band": both.mean(axis=0).tolist(),
+        "worst_decile_of_patients": float(patients[: max(1, round(len(patients) / 10))].mean()),
+        "samplewise": float(np.concatenate(held).all(axis=1).mean()),
+        "median_half_width_mm": np.median(np.concatenate([each.half_width[1:] for each in found]), axis=0).tolist(),
+        "error_mae_mm": np.concatenate([each.error for each in found]).mean(axis=0).tolist(),
+        "intervals": len(both),
+        "patients": len(patients),
+    }

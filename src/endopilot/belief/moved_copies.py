@@ -1,4 +1,4 @@
-"""Copies of simulated devices, turned to all sides (`Fans`), or moved until one lies as X-ray shows it (`MovedCopies`).
+"""Copies of simulated devices, turned to all sides, or moved until one lies as X-ray shows it (`MovedCopies`).
 
 Soft devices lie otherwise after they were pushed and pulled, though their drives are where they were: what lies in
 loops comes out elsewhere. So copies whose drives go somewhere and come back lie in many of the ways in which the real
@@ -14,43 +14,28 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.stack import Stack
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.types import Anatomy
 
-_SIDES = 16
+SIDES = 16
 """Angles that a wire is turned to where its rotation is looked for."""
 
 
-class Fans:
-    """Copies of a member of a belief, each turned by another angle; members of a kind share theirs."""
-
-    def __init__(self, kinds: Sequence[tuple[Anatomy, Stack]], motion: Motion | None, config: SimulatorConfig) -> None:
-        self._kinds, self._motion, self._config = kinds, motion, config
-        self._made = dict[int, Simulator]()
-
-    def of(self, kind: int, member: int, simulator: Simulator) -> Simulator:
-        """Return copies of a member as it lies now, those turned to more than half a turn backwards."""
-        if kind not in self._made:
-            anatomy, stack = self._kinds[kind]
-            self._made[kind] = Simulator(
-                anatomy, stack, worlds=_SIDES, motion=self._motion, config=self._config, sharing=[simulator]
-            )
-        fan, side = self._made[kind], 2 * np.pi * np.arange(_SIDES) / _SIDES
-        fan.copy_worlds(np.full(_SIDES, member), of=simulator)
-        turn = np.where(side > np.pi, side - 2 * np.pi, side)
-        fastest = self._kinds[kind][1].wire.max_rotation_rad_s
-        periods = int(np.ceil(np.pi / (fastest * DECISION_PERIOD_S)))
-        control = np.zeros((_SIDES, fan.devices, 2))
-        control[:, 0, 1] = turn / (periods * DECISION_PERIOD_S)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # one that fails stays where it was
-            for _ in range(periods):
-                fan.step(control, DECISION_PERIOD_S)
-        return fan
+def turn_to_all_sides(fan: Simulator, member: int, of: Simulator) -> None:
+    """Make `SIDES` worlds copies of a member as it lies now, each turned by another angle as fast as its drive may:
+    those to more than half a turn backwards."""
+    fan.copy_worlds(np.full(SIDES, member), of=of)
+    side = 2 * np.pi * np.arange(SIDES) / SIDES
+    turn = np.where(side > np.pi, side - 2 * np.pi, side)
+    fastest = fan.set_up.stacks[0].wire.max_rotation_rad_s
+    periods = int(np.ceil(np.pi / (fastest * DECISION_PERIOD_S)))
+    control = np.zeros((SIDES, fan.devices, 2))
+    control[:, 0, 1] = turn / (periods * DECISION_PERIOD_S)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # one that fails stays where it was
+        for _ in range(periods):
+            fan.step(control, DECISION_PERIOD_S)
 
 
 def shifted(
@@ -88,19 +73,9 @@ class MovedCopies:
         at: the one that was found nearest to what X-ray shows.
     """
 
-    def __init__(
-        self,
-        kind: tuple[Anatomy, Stack],
-        count: int,
-        *,
-        limits: Sequence[DriveLimits],
-        motion: Motion | None,
-        config: SimulatorConfig,
-        sharing: Simulator,
-    ) -> None:
-        anatomy, stack = kind
-        self.simulator = Simulator(anatomy, stack, worlds=count, motion=motion, config=config, sharing=[sharing])
-        self._limits = list(limits)
+    def __init__(self, simulator: Simulator, limits: Sequence[DriveLimits]) -> None:
+        """Take a simulator of as many worlds as there are to be copies, and the limits of each device's drive."""
+        self.simulator, self._limits = simulator, list(limits)
         self._random, self.at = np.random.default_rng(0xC0B1), 0
 
     def seek(self, member: int, of: Simulator, misfit: Misfit) -> float:
@@ -152,8 +127,8 @@ def turned(
         end, direction = simulator.tip_position[member, 0], simulator.tip_direction[member, 0]
         return np.tile(end, (len(turn), 1)), np.tile(direction, (len(turn), 1))
     ends, directions = fan.tip_position[:, 0], fan.tip_direction[:, 0]
-    place = (turn % (2 * np.pi)) * _SIDES / (2 * np.pi)
-    low = place.astype(int) % _SIDES
+    place = (turn % (2 * np.pi)) * SIDES / (2 * np.pi)
+    low = place.astype(int) % SIDES
     share = (place % 1.0)[:, None]
-    mixed = [(1 - share) * each[low] + share * each[(low + 1) % _SIDES] for each in (ends, directions)]
+    mixed = [(1 - share) * each[low] + share * each[(low + 1) % SIDES] for each in (ends, directions)]
     return mixed[0], mixed[1] / np.maximum(np.linalg.norm(mixed[1], axis=1, keepdims=True), 1e-9)

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.models.hypotheses import HYPOTHESES, Displaced
+from endopilot.models.hypotheses import DRIFT, HYPOTHESES, REGISTRATION
 from endopilot.simulation.motion import AMPLITUDES, Motion, contracted_share, place
 
 _HEART = {
@@ -40,7 +40,7 @@ _USUAL_HZ = (1.17, 0.2), (0.25, 0.06)
 _PHASE, _FINE = 0.08, np.arange(-8, 9) / 8
 """Frequencies that are tried differ by this share of a period over the whole time; and finer ones near the best, in
 shares of that."""
-_DRIFT_SD = np.array([each.parameters[0].other for each in HYPOTHESES if isinstance(each, Displaced)])
+_DRIFT_SD = np.array([each.parameters[0].other for each in HYPOTHESES if each.name in (REGISTRATION, DRIFT)])
 """Standard deviations of a registration that errs, mm, and of its drift, mm a minute."""
 _ALONG_MM, _ACROSS_MM, _HEAVY = 3.0, 0.6, 12.0
 """Standard deviations of a predicted tip's error along and across the wire, mm: the motion also drives the wire to and

@@ -6,7 +6,8 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from types import SimpleNamespace
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -133,58 +134,43 @@ class Thought(Generic[Found]):
         """
         self.busy, self._granted, self._seconds = True, pace.evaluations, pace.seconds
         budget.begin(granted=0.0)
-        self._budget, self._thread = budget, _Thread(work, budget)
+        self._budget, self._at = budget, SimpleNamespace(found=None, error=None, ended=False)
+        self._thread = threading.Thread(target=_think, args=(work, budget, self._at), daemon=True)
         self._thread.start()
-        weakref.finalize(self, self._thread.stop)
+        weakref.finalize(self, _end, budget, self._thread)
 
     @property
     def found(self) -> Found | None:
         """The answer as far as it is known; None if nothing of it is."""
-        return self._thread.found
+        return self._at.found
 
     def wait(self) -> None:
         """Let it go on for a decision; what fails in it is raised here."""
         self._budget.grant(self._granted if self._seconds is None else np.inf, self._seconds)
-        self.busy = not self._thread.ended
-        if self._thread.error is not None:
-            raise self._thread.error
+        self.busy = not self._at.ended
+        if self._at.error is not None:
+            raise self._at.error
 
     def stop(self) -> None:
         """End it: what it was begun from is no longer believed."""
-        self._thread.stop()
+        _end(self._budget, self._thread)
         self.busy = False
 
 
-class _Thread(threading.Thread):
-    """The thread of a thought, which does not hold it.
+def _think(work: Callable[..., object], budget: Budget, at: SimpleNamespace) -> None:
+    """Work in a thread, which does not hold the thought."""
+    try:
+        at.found = work(lambda found: setattr(at, "found", found))
+    except CancelledError:
+        pass
+    except Exception as error:  # raised where it is waited for
+        at.error = error
+    at.ended = True
+    budget.end()
 
-    Attributes:
-        found: the answer as far as it is known.
-        error: what the work raised.
-        ended: whether it is over.
-    """
 
-    def __init__(self, work: Callable[..., object], budget: Budget) -> None:
-        super().__init__(daemon=True)
-        self._work, self._budget, self.ended = work, budget, False
-        self.found: Any = None
-        self.error: Exception | None = None
-
-    def run(self) -> None:
-        try:
-            self.found = self._work(self._note)
-        except CancelledError:
-            pass
-        except Exception as error:  # raised where it is waited for
-            self.error = error
-        self.ended = True
-        self._budget.end()
-
-    def stop(self) -> None:
-        """End the work, and wait until it has."""
-        self._budget.cancel()
-        if threading.current_thread() is not self:
-            self.join()
-
-    def _note(self, found: Any) -> None:
-        self.found = found
+def _end(budget: Budget, thread: threading.Thread) -> None:
+    """End the work in a thread, and wait until it has."""
+    budget.cancel()
+    if threading.current_thread() is not thread:
+        thread.join()

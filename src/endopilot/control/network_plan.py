@@ -15,7 +15,7 @@ from jaxtyping import Float
 from endopilot.control.plan_config import Steps
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import Episodes, EpisodeSetUp
+from endopilot.models.episodes import Episodes
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
@@ -56,7 +56,6 @@ class RestingStart:
     def __init__(self, navigation: Navigation) -> None:
         """Simulate the wire at rest."""
         self.navigation, config = navigation, SimulatorConfig(threads=1)
-        self._setup = EpisodeSetUp.of_anatomy(navigation.anatomy, navigation.device, config)
         simulator = Simulator(navigation.anatomy, navigation.device, config=config)
         simulator.reset(inserted_length=[navigation.start_inserted_length_mm], rotation=[navigation.start_rotation_rad])
         tip = simulator.project()[:, 0]
@@ -66,7 +65,8 @@ class RestingStart:
         """Return episodes of 15 s of rest and then some tips (mm) and controls (mm/s, rad/s)."""
         rest = np.zeros((len(tips), WINDOW, 2))
         return Episodes.of_controls(
-            self._setup,
+            self.navigation.anatomy,
+            self.navigation.device,
             initial=np.array([self.navigation.start_inserted_length_mm, self.navigation.start_rotation_rad]),
             control=np.concatenate([rest, control], axis=1),
             tip=np.concatenate([rest + self.tip, tips], axis=1),

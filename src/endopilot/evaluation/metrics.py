@@ -4,9 +4,7 @@ as diverged."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,48 +20,7 @@ PAPER_ERRORS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 """Mean and SD of the absolute tip error, mm, as Kim et al. publish them (Hamlyn 2023, arXiv 2304.09286)."""
 
 DIVERGED_MM = 2.0  # a rollout whose absolute error of Δtip passes this, mm, once or more, has diverged
-OFF_WALL_MM = 0.1  # a tip with more than this between wire and wall, mm, is off the wall
-
-
-DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)  # edges of parts of the vessel, by true Δtip, mm
-
-_PUSHED_MM, _STUCK_SHARE = 0.5, 0.1
-_SLIP_MM = 1.0
-_WHIP_RAD, _BEND_PER_MM = 0.5, 0.2
 _STEPS = 2000
-
-
-def tip_events(
-    inserted: Float[np.ndarray, "episodes samples"],
-    rotation: Float[np.ndarray, "episodes samples"],
-    abscissa: Float[np.ndarray, "episodes samples"],
-    direction: Float[np.ndarray, "episodes samples 3"],
-) -> dict[str, Bool[np.ndarray, "episodes later"]]:
-    """Return in which samples after the first the tip does not go with the drive (lengths in mm, angles in rad).
-
-    `stick`: the drive moves by more than 0.5 mm, and the tip by less than a tenth of that. `slip`: the tip moves by 1
-    mm more than the drive, or as much the other way. `whip`: the tip's direction turns by 0.5 rad more than the drive
-    and the bends that it passes (0.2 rad a mm, which few arteries exceed) explain.
-    """
-    pushed, moved = np.diff(inserted.astype(float), axis=1), np.diff(abscissa.astype(float), axis=1)
-    turned = np.abs(np.diff(rotation.astype(float), axis=1))
-    cosine = (direction[:, 1:].astype(float) * direction[:, :-1]).sum(axis=-1)
-    swung = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return {
-        "stick": (np.abs(pushed) > _PUSHED_MM) & (np.abs(moved) < _STUCK_SHARE * np.abs(pushed)),
-        "slip": (np.abs(moved) > np.abs(pushed) + _SLIP_MM) | (moved * np.sign(pushed) < -_SLIP_MM),
-        "whip": swung > turned + _BEND_PER_MM * np.abs(moved) + _WHIP_RAD,
-    }
-
-
-def by_depth(
-    error: Float[np.ndarray, "episodes samples"], depth: Float[np.ndarray, "episodes samples"]
-) -> dict[str, dict[str, float | int | None]]:
-    """Return the statistics of an error over the parts of the vessel that `DEPTHS_MM` bounds, keys such as "30-60"."""
-    return {
-        f"{low:g}-{high:g}": error_statistics(np.where((depth >= low) & (depth < high), error, np.nan))
-        for low, high in pairwise(DEPTHS_MM)
-    }
 
 
 def span_name(span: tuple[float, float]) -> str:
@@ -194,33 +151,19 @@ def distribution(values: Float[np.ndarray, "n"]) -> dict[str, float | int | None
 def tip_statistics(
     error: Float[np.ndarray, "episodes samples"],
     *,
-    radius: Float[np.ndarray, "episodes samples"],
     baselines: Mapping[str, Float[np.ndarray, "episodes samples"]],
     anatomy: Int[np.ndarray, "episodes"],
     sample_period_s: float,
     seed: int,
 ) -> dict[str, dict]:
-    """Return for each span and for "all" samples the statistics of a tip coordinate's error, mm, and, as `over_radius`,
-    of that over the lumen radius at the true tip. `baselines` has errors on the same samples, mm, by name."""
+    """Return for each span and for "all" samples the statistics of a tip coordinate's error, mm. `baselines` has errors
+    on the same samples, mm, by name."""
     spans: dict[str, slice] = {**span_slices(error.shape[1], sample_period_s), "all": slice(None)}
     statistics = {}
     for name, samples in spans.items():
         part = error[:, samples]
         statistics[name] = error_statistics(part) | {
             "intervals": bootstrap_intervals(part, anatomy, seed=seed),
-            "over_radius": error_statistics(part / radius[:, samples]),
             "skill": {key: skill(part, other[:, samples]) for key, other in baselines.items()},
         }
     return statistics
-
-
-def worst_anatomy(
-    error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], names: Sequence[str]
-) -> dict[str, str | float] | None:
-    """Return the anatomy with the largest mean absolute error, and that error in mm; None without any sample."""
-    means = {int(index): error_statistics(error[anatomy == index])["mae"] for index in np.unique(anatomy)}
-    known = {index: mae for index, mae in means.items() if mae is not None}
-    if not known:
-        return None
-    worst = max(known, key=lambda index: known[index])
-    return {"name": str(names[worst]), "mae": float(known[worst])}

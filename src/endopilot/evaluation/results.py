@@ -13,17 +13,13 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import (
-    OFF_WALL_MM,
-    by_depth,
     control_rmse,
     distribution,
     diverged_share,
     error_statistics,
-    rmse_of_sequences,
     skill,
     span_slices,
     tip_statistics,
-    worst_anatomy,
 )
 from endopilot.files import reading, regular, writing
 
@@ -37,7 +33,6 @@ SERIES_TITLES: Mapping[str, str] = {
     "P2": "Inverse network (P2)",
     "P3": "Inverse into forward network (P3)",
     "P4": "Controls of P3, simulated (P4)",
-    "P4_replanned": "The same, planned anew at an X-ray image every 10 s",
     "P2_replayed": "Controls of P2, simulated",
     "hold_slack": "Baseline: hold slack and offset",
     "training_mean": "Baseline: training mean",
@@ -53,7 +48,6 @@ TIP_BASELINES: Mapping[str, tuple[str, ...]] = {
     "P1": ("hold_slack", "training_mean"),
     "P3": ("hold_control", "follow_slack"),
     "P4": ("hold_control", "follow_slack"),
-    "P4_replanned": ("hold_control", "follow_slack"),
     "P2_replayed": ("hold_control", "follow_slack"),
 }
 """Baselines that stand beside each protocol's tip errors. Those of P1 know the true controls, as it does; those of P3
@@ -88,10 +82,7 @@ class SplitResult:
         anatomy: index in `anatomies` of each episode; `sequence` among those of its anatomy.
         true_control: the recorded control, (mm/s, rad/s); `controls` the predicted ones by series.
         tips: predicted tips by series (see `SERIES_TITLES`).
-        base_force: axial force of the drive by simulated series, "true" being the recorded one, N; `base_torque`
-            likewise, N·mm.
         tip_distance: distance between the simulated and the recorded tip in space, by simulated series, mm.
-        events: where the recorded tip sticks, slips or whips (see `metrics.tip_events`).
     """
 
     sample_period_s: float
@@ -103,10 +94,7 @@ class SplitResult:
     true_control: Float[np.ndarray, "episodes samples 2"]
     tips: Mapping[str, TipSeries]
     controls: Mapping[str, Float[np.ndarray, "episodes samples 2"]]
-    base_force: Mapping[str, Float[np.ndarray, "episodes samples"]]
-    base_torque: Mapping[str, Float[np.ndarray, "episodes samples"]]
     tip_distance: Mapping[str, Float[np.ndarray, "episodes samples"]]
-    events: Mapping[str, Bool[np.ndarray, "episodes samples"]]
 
     @property
     def time_s(self) -> Float[np.ndarray, "samples"]:
@@ -117,18 +105,13 @@ class SplitResult:
         """Return predicted − true "abscissa" or "offset" of a series, mm; NaN where the prediction failed."""
         return getattr(self.tips[series], coordinate) - getattr(self.true, coordinate)
 
-    def drive_difference(self, series: str, signal: str) -> Float[np.ndarray, "episodes samples"]:
-        """Return simulated − recorded "force" (N) or "torque" (N·mm) of the drive; NaN where the simulation failed."""
-        of = getattr(self, f"base_{signal}")
-        return of[series] - of["true"]
-
     def lost(self, series: str) -> Bool[np.ndarray, "episodes samples"]:
         """Return where a series has no finite tip."""
         tip = self.tips[series]
         return ~(np.isfinite(tip.abscissa) & np.isfinite(tip.offset))
 
 
-_MAPPINGS = ("controls", "base_force", "base_torque", "tip_distance", "events")
+_MAPPINGS = ("controls", "tip_distance")
 _TIP_FIELDS = ("abscissa", "offset", "radius")
 
 
@@ -187,17 +170,15 @@ SPLIT_TITLES: Mapping[str, str] = {"seen_test": "New navigations, known patients
 
 
 def summarize(result: SplitResult, *, seed: int) -> dict[str, Any]:
-    """Return the figures of one split: tips, controls, safety ratios and forces of drive, by series."""
+    """Return the figures of one split: tips, controls and safety ratios, by series."""
     baselines = [name for names in TIP_BASELINES.values() for name in names]
     shown = [name for name in dict.fromkeys((*TIP_BASELINES, *baselines, *REPLAYED)) if name in result.tips]
     return {
         "anatomies": list(result.anatomies),
         "episodes": len(result.anatomy),
-        "event_shares": {name: float(where.mean()) for name, where in result.events.items()},
         "tip": {series: _tip(result, series, seed) for series in shown},
         "control": _control(result),
         "safety": {series: _safety(result, series) for series in ("true", *shown)},
-        "drive": {series: _drive(result, series) for series in result.base_force if series != "true"},
     }
 
 
@@ -207,23 +188,15 @@ def _tip(result: SplitResult, series: str, seed: int) -> dict[str, Any]:
     out: dict[str, Any] = {
         coordinate: tip_statistics(
             result.error(series, coordinate),
-            radius=result.true.radius,
             baselines={name: result.error(name, coordinate) for name in baselines},
             anatomy=result.anatomy,
             sample_period_s=result.sample_period_s,
             seed=seed,
         )
-        | {"by_depth": by_depth(result.error(series, coordinate), result.true.abscissa)}
         for coordinate in ("abscissa", "offset")
     }
-    clearance = result.true.radius - result.wire_radius_mm - result.true.offset
-    off_wall = clearance > OFF_WALL_MM
-    error = result.error(series, "abscissa")
-    out["offset_off_wall"] = error_statistics(np.where(off_wall, result.error(series, "offset"), np.nan))
-    out["off_wall_share"] = float(off_wall.mean())
-    out["diverged_share"] = diverged_share(error, lost)
+    out["diverged_share"] = diverged_share(result.error(series, "abscissa"), lost)
     out["lost_share"] = float(lost.mean())
-    out["worst_anatomy"] = worst_anatomy(error, result.anatomy, result.anatomies)
     if series in result.tip_distance:
         out["distance_3d"] = error_statistics(result.tip_distance[series])
     return out
@@ -274,15 +247,6 @@ def _safety(result: SplitResult, series: str) -> dict[str, Any]:
     }
 
 
-def _drive(result: SplitResult, series: str) -> dict[str, Any]:
-    out = {}
-    for key, signal in (("force_n", "force"), ("torque_nmm", "torque")):
-        difference = result.drive_difference(series, signal)
-        of_sequences = distribution(rmse_of_sequences(difference))
-        out[key] = error_statistics(difference) | {"rmse_of_sequences": of_sequences}
-    return out
-
-
 def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
     """Return how much larger mean absolute errors are in new patients than in those trained on: by series, coordinate
     and span `difference` (mm) and `ratio`, None where unknown; empty without both kinds of patients."""
@@ -294,7 +258,6 @@ def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
             coordinate: {
                 span: _gap(known["tip"][series][coordinate][span]["mae"], new["tip"][series][coordinate][span]["mae"])
                 for span in new["tip"][series][coordinate]
-                if span != "by_depth"
             }
             for coordinate in ("abscissa", "offset")
         }

@@ -35,7 +35,7 @@ def read_run(run: str | Path) -> dict[str, Any]:
         raise InputError(f"{run}: no such run; give a folder made by `endopilot train`, or '{WIRES}'")
     path = Path(run) / "manifest.json"
     record = read_json(path) if path.exists() else None
-    if not isinstance(record, dict) or not {"config", "device", "networks"} <= record.keys():
+    if not isinstance(record, dict) or not {"config", "device", "networks", "patients"} <= record.keys():
         what = "is missing" if record is None else "is not of a run"
         raise InputError(f"{run}: no finished run here (manifest.json {what}); make one with `endopilot train`")
     return record

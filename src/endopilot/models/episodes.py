@@ -1,20 +1,19 @@
-"""What a predictor is given of navigations, `Episodes`, and what it returns, `OpenLoop` or `Prediction`.
+"""What a predictor is given of navigations, `Episodes`, and what it returns, `OpenLoop`.
 
-A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`; `trained_patients` says which of them a
-run was trained on. A navigation under way fills the fields with what its encoder and its X-ray images have measured so
-far; `EpisodeSetUp.of_anatomy` holds its vessel in memory.
+A dataset gives them by `Episodes.of_dataset`, a plan or a navigation under way by `Episodes.of_controls`;
+`trained_patients` says which of them a run was trained on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Shaped
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, check_same_wire
@@ -31,53 +30,6 @@ AnyNetwork = TypeVar("AnyNetwork")
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeSetUp:
-    """What episodes have in common: the vessels that they may lie in, and the devices.
-
-    Attributes:
-        anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
-        device: the wire, or the wire in its catheters, as they are given.
-        simulator: settings of the rod core.
-        known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
-            not there, or None, lie still.
-    """
-
-    anatomies: Mapping[str, Callable[[], Anatomy]]
-    device: Wire | Stack
-    simulator: SimulatorConfig
-    known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
-
-    @staticmethod
-    def of_anatomy(anatomy: Anatomy, device: Wire | Stack, simulator: SimulatorConfig) -> EpisodeSetUp:
-        """Return the setup of navigations in one vessel that is in memory."""
-        return EpisodeSetUp({anatomy.name: lambda: anatomy}, device, simulator)
-
-    @staticmethod
-    def of_dataset(dataset: Dataset) -> EpisodeSetUp:
-        """Return the setup of a dataset.
-
-        Of patients who move the published mean is known, with the phase of heart and breath.
-        """
-
-        def read(name: str) -> Anatomy:
-            return read_anatomy(dataset.anatomy_folder(name))
-
-        with reading(dataset.folder, "make the dataset again"):
-            device = dataset.stack
-            simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-        return EpisodeSetUp(
-            anatomies={name: partial(read, name) for name in dataset.patients},
-            device=device,
-            simulator=simulator,
-            known_motions={
-                name: published_mean(motion)
-                for name in dataset.patients
-                if (motion := dataset.motion(name)) is not None
-            },
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class Episodes:
     """Navigations of equal length as a predictor is given them. Sample t is the state at the end of period t.
 
@@ -85,32 +37,34 @@ class Episodes:
     hold anything there, such as the tip that is desired.
 
     Attributes:
-        setup: the vessels and the wire.
+        anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
+        device: the wire, or the wire in its catheters, as they are given.
+        simulator: settings of the rod core.
+        known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
+            not there, or None, lie still.
         anatomy: name of each episode's anatomy.
-        initial: (Δ mm, φ rad) of the wire before the first period.
+        start: (Δ mm, φ rad) of the wire and its catheters before the first period.
         control: π = (mm/s, rad/s) that the wire's drive made, the mean over each period.
         command: what the drives of wire and catheters were commanded (mm/s, rad/s), see `Dataset.command`.
         proximal: x^prox = (Δ mm, φ rad).
         tip: (Δtip, γtip), mm.
-        branch: index of the branch that the tip lies in.
-        tip_sd: standard deviations of (Δtip, γtip) as whatever measured them states them, mm; 0 where it states none.
-        catheters: (Δ mm, φ rad) of the catheters before the first period.
     """
 
-    setup: EpisodeSetUp
+    anatomies: Mapping[str, Callable[[], Anatomy]]
+    device: Wire | Stack
+    simulator: SimulatorConfig
+    known_motions: Mapping[str, Motion | None]
     anatomy: Shaped[np.ndarray, "episodes"]
-    initial: Float[np.ndarray, "episodes 2"]
+    start: Float[np.ndarray, "episodes devices 2"]
     control: Float[np.ndarray, "episodes samples 2"]
     command: Float[np.ndarray, "episodes samples devices 2"]
     proximal: Float[np.ndarray, "episodes samples 2"]
     tip: Float[np.ndarray, "episodes samples 2"]
-    branch: Int[np.ndarray, "episodes samples"]
-    tip_sd: Float[np.ndarray, "episodes samples 2"]
-    catheters: Float[np.ndarray, "episodes catheters 2"]
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> Episodes:
-        """Return the navigations of a dataset, with their true tips.
+        """Return the navigations of a dataset, with their true tips. Of patients who move the published mean is known,
+        with the phase of heart and breath.
 
         Raises:
             InputError: they are no longer than the states that a predictor is given.
@@ -122,85 +76,68 @@ class Episodes:
                 f"{dataset.folder}: episodes of {samples} samples leave nothing to predict after {WINDOW} given ones; "
                 f"make the dataset with seconds of {seconds:g} or more"
             )
+        with reading(dataset.folder, "make the dataset again"):
+            device, simulator = dataset.stack, SimulatorConfig(**dataset.manifest["config"]["simulator"])
+        motions = {name: dataset.motion(name) for name in dataset.patients}
         return Episodes(
-            setup=EpisodeSetUp.of_dataset(dataset),
+            anatomies={name: partial(_read, dataset, name) for name in dataset.patients},
+            device=device,
+            simulator=simulator,
+            known_motions={name: published_mean(motion) for name, motion in motions.items() if motion is not None},
             anatomy=dataset.anatomy,
-            initial=dataset.initial[:, 0],
+            start=dataset.initial,
             control=dataset.control[:, :, 0],
             command=dataset.command,
             proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1)[:, :, 0],
             tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1)[:, :, 0],
-            branch=dataset.branch[:, :, 0],
-            tip_sd=np.zeros((*dataset.valid.shape, 2), dtype=np.float32),
-            catheters=dataset.initial[:, 1:],
         )
 
     @staticmethod
     def of_controls(
-        setup: EpisodeSetUp,
+        anatomy: Anatomy,
+        device: Wire,
         *,
         initial: Float[np.ndarray, "2"],
         control: Float[np.ndarray, "episodes samples 2"],
         tip: Float[np.ndarray, "episodes samples 2"],
     ) -> Episodes:
-        """Return planned navigations in a setup's only vessel; the drive makes exactly what it is commanded.
+        """Return navigations in one vessel whose drive makes exactly what it is commanded.
 
         Args:
-            setup: of one anatomy.
+            anatomy: the vessel.
+            device: the wire.
             initial: (Δ mm, φ rad) before the first period.
             control: π = (mm/s, rad/s).
-            tip: (Δtip, γtip), mm: at rest in the first branch, then as desired or predicted.
+            tip: (Δtip, γtip), mm, as measured, desired or predicted.
         """
-        (name,) = setup.anatomies
-        count, samples = control.shape[:2]
         return Episodes(
-            setup=setup,
-            anatomy=np.full(count, name),
-            initial=np.tile(initial, (count, 1)),
+            anatomies={anatomy.name: lambda: anatomy},
+            device=device,
+            simulator=SimulatorConfig(threads=1),
+            known_motions={},
+            anatomy=np.full(len(control), anatomy.name),
+            start=np.tile(initial, (len(control), 1, 1)),
             control=control,
             command=control[:, :, None].astype(float),
             proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
             tip=tip,
-            branch=np.zeros((count, samples), dtype=np.int64),
-            tip_sd=np.zeros((count, samples, 2)),
-            catheters=np.zeros((count, 0, 2)),
         )
 
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.anatomy)
 
-    @property
-    def start(self) -> Float[np.ndarray, "episodes devices 2"]:
-        """(Δ mm, φ rad) of the wire and its catheters before the first period."""
-        return np.concatenate([self.initial[:, None], self.catheters], axis=1).astype(float)
-
-    @property
-    def samples(self) -> int:
-        """Number of samples of each episode."""
-        return self.tip.shape[1]
-
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
         """Return the chosen episodes, given as a mask or as indices."""
-        names = [each.name for each in fields(self) if each.name != "setup"]
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
-
-    def from_sample(self, first: int) -> Episodes:
-        """Return the episodes from a sample on; the state before it is their initial one."""
-        if first == 0:
-            return self
-        names = ("control", "command", "proximal", "tip", "branch", "tip_sd")
-        later = {name: getattr(self, name)[:, first:] for name in names}
-        return replace(self, initial=self.proximal[:, first - 1], **later)
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: each[chosen] for name, each in arrays.items() if isinstance(each, np.ndarray)})
 
 
-Observed = Bool[np.ndarray, "samples"]
-"""Samples at which the tip was observed, for example by X-ray; the same for all episodes."""
-EachObserved = Bool[np.ndarray, "episodes samples"]
-"""The same for each episode."""
+def _read(dataset: Dataset, name: str) -> Anatomy:
+    return read_anatomy(dataset.anatomy_folder(name))
+
+
 Steps2 = Float[np.ndarray, "episodes steps 2"]
-JUMP_MM = 3.0
-"""A tip jumps where it moves by this much more or less in a sample than the drive, mm: a snap, or a branch lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,28 +155,10 @@ class OpenLoop:
     control: Steps2
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """The predicted tip of each episode at every sample.
-
-    Attributes:
-        tip: (Δtip, γtip), mm.
-        spread: one standard deviation of its error as the model estimates it, mm.
-        jump: probability that the tip jumps in the sample: see `jumps`.
-    """
-
-    tip: Float[np.ndarray, "episodes samples 2"]
-    spread: Float[np.ndarray, "episodes samples 2"]
-    jump: Float[np.ndarray, "episodes samples"]
-
-
 @runtime_checkable
 class Predictor(Protocol):
-    """Whatever predicts episodes: the networks of a run, the simulated wires, or a baseline.
-
-    The first 30 states of an episode are given, and it goes on without measurements. P3 may also begin later, in a
-    navigation under way whose tip was observed now and then.
-    """
+    """Whatever predicts episodes, whose first 30 states are given: the networks of a run, the simulated wires, or a
+    baseline."""
 
     def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
@@ -249,21 +168,9 @@ class Predictor(Protocol):
         """P2: predict the controls that bring about the true tip."""
         ...
 
-    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
-        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
-
-        Args:
-            episodes: up to the last observed sample, the motion of the drive as it was, and the tip as observed or
-                else as predicted at the time; after it, the desired tip.
-            observed: the 30 given states if not given; else also later samples at which the tip was observed. What
-                comes after the last of them is predicted.
-        """
+    def rollout_dual(self, episodes: Episodes) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to."""
         ...
-
-
-def given_states(episodes: Episodes) -> Observed:
-    """Return the samples at which the tip is observed in every protocol: the first 30."""
-    return np.arange(episodes.samples) < WINDOW
 
 
 def needed(network: AnyNetwork | None, role: str) -> AnyNetwork:
@@ -275,19 +182,6 @@ def needed(network: AnyNetwork | None, role: str) -> AnyNetwork:
     if network is None:
         raise InputError(f"the run has no {role} network; train it with --network both")
     return network
-
-
-def begin_after(observed: Observed) -> int:
-    """Return the first sample that is to be predicted: the one after the last observed one."""
-    return int(np.flatnonzero(observed)[-1]) + 1
-
-
-def jumps(
-    tip_mm: Float[np.ndarray, "episodes samples"], inserted_length_mm: Float[np.ndarray, "episodes samples"]
-) -> Bool[np.ndarray, "episodes samples"]:
-    """Return the samples in which a tip at abscissas Δtip jumps: it moves otherwise than the drive by `JUMP_MM`."""
-    slack = inserted_length_mm - tip_mm
-    return np.abs(np.diff(slack, axis=1, prepend=slack[:, :1])) > JUMP_MM
 
 
 def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
@@ -302,18 +196,11 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
-    """Return the names of the patients of a dataset that a run was trained on.
-
-    A patient is known by the SHA-256 of the anatomy.
+    """Return the names of the patients of a dataset that a run was trained on, by the SHA-256 of their anatomies.
 
     Raises:
-        InputError: the run is too old to name its patients, or the dataset was made with another wire.
+        InputError: the dataset was made with another wire.
     """
     check_wire(run, record, dataset)
-    if "patients" in record:
-        return frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
-    if record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
-        return frozenset(dataset.of_split("train").anatomy.tolist())
-    raise InputError(
-        f"{run}: does not name the patients that it was trained on, as it was made by an older version; train it again"
-    )
+    trained = set(record["patients"])
+    return frozenset(name for name, sha in dataset.patients.items() if sha in trained)

@@ -10,12 +10,11 @@ An innovation has a Cauchy density, with heavy tails: a tip that snapped a momen
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -48,67 +47,42 @@ class Parameter(NamedTuple):
     """Whether it is a factor on what is given; else 0 is as given."""
 
 
-class Hypothesis(ABC):
-    """One thing that may be other than given.
+class Hypothesis(NamedTuple):
+    """One thing that may be other than given."""
 
-    Attributes:
-        name: in words.
-        parameters: that it leaves open.
-        of_kind: whether worlds that differ in it are of other wires or vessels; others are simulated side by side.
-        costly: whether each value needs a simulator of its own, so that few are tried.
-    """
-
-    def __init__(self, name: str, *parameters: Parameter, of_kind: bool = True, costly: bool = False) -> None:
-        self.name, self.parameters, self.of_kind, self.costly = name, parameters, of_kind, costly
-
-    @abstractmethod
-    def world(self, world: World, values: Mapping[str, float]) -> World:
-        """Return a world in which its parameters have these values."""
+    name: str
+    """In words."""
+    parameters: tuple[Parameter, ...]
+    """That it leaves open."""
+    of_kind: bool = True
+    """Whether worlds that differ in it are of other wires or vessels; others are simulated side by side."""
+    costly: bool = False
+    """Whether each value needs a simulator of its own, so that few are tried."""
 
 
-class Differs(Hypothesis):
-    """Fields of a world of the same names differ."""
-
-    def world(self, world: World, values: Mapping[str, float]) -> World:
-        """Return a world with these fields."""
-        return replace(world, **{each.name: values[each.name] for each in self.parameters})
+def _beside(field: str, words: str, usual: float, other: float, most: float) -> tuple[Parameter, ...]:
+    """Return the components of a field of a world by which X-ray shows the wire beside where it lies."""
+    axes = ((f"{field} {side}", f"{words} {{:.1f}} to {{:.1f}} towards {side}") for side in _SIDES)
+    return tuple(Parameter(name, usual, other, -most, most, what, False) for name, what in axes)
 
 
-class CompliantWall(Hypothesis):
-    """The wall yields; 0 is rigid."""
-
-    def world(self, world: World, values: Mapping[str, float]) -> World:
-        """Return a world with a wall of that compliance."""
-        compliance = values[self.parameters[0].name]
-        return replace(world, compliant_wall_n_mm2=None if compliance < _RIGID else COMPLIANT_N_MM2 / compliance)
+_SIDES = ("left", "back", "head")  # of LPS
 
 
-class Displaced(Hypothesis):
-    """X-ray shows the wire beside where it lies: a field of a world that is a vector has these components, LPS."""
-
-    def __init__(self, name: str, field: str, usual: float, other: float, most: float, words: str) -> None:
-        axes = ((side, f"{words} {{:.1f}} to {{:.1f}} towards {side}") for side in ("left", "back", "head"))
-        parameters = [Parameter(f"{field} {side}", usual, other, -most, most, what, False) for side, what in axes]
-        super().__init__(name, *parameters, of_kind=False)
-        self._field = field
-
-    def world(self, world: World, values: Mapping[str, float]) -> World:
-        """Return a world that is registered so."""
-        return replace(world, **{self._field: tuple(values[each.name] for each in self.parameters)})
-
-
-class OtherHeart(Hypothesis):
-    """A heart that is known to beat does so with other amplitudes."""
-
-    def world(self, world: World, values: Mapping[str, float]) -> World:
-        """Return a world that moves so; one without a motion stays as it is."""
-        if (known := world.motion) is None:
-            return world
+def _made(world: World, values: Mapping[str, float]) -> World:
+    """Return a world in which parameters have these values; a heart beats otherwise only if it is known to beat."""
+    changed: dict[str, Any] = {name: each for name, each in values.items() if name in World.__dataclass_fields__}
+    for field in ("registration_mm", "drift_mm_min"):
+        if f"{field} {_SIDES[0]}" in values:
+            changed[field] = tuple(values[f"{field} {side}"] for side in _SIDES)
+    if "compliance" in values:  # 0 is rigid
+        compliance = values["compliance"]
+        changed["compliant_wall_n_mm2"] = None if compliance < _RIGID else COMPLIANT_N_MM2 / compliance
+    if (known := world.motion) is not None and "heart_volume_factor" in values:
         share = min(known.heart_volume_share * values["heart_volume_factor"], 0.3)
-        return replace(
-            world,
-            motion=replace(known, annulus_mm=known.annulus_mm * values["annulus_factor"], heart_volume_share=share),
-        )
+        annulus_mm = known.annulus_mm * values["annulus_factor"]
+        changed["motion"] = replace(known, annulus_mm=annulus_mm, heart_volume_share=share)
+    return replace(world, **changed)
 
 
 def _of_patients(amplitude: str, name: str) -> Parameter:
@@ -117,35 +91,42 @@ def _of_patients(amplitude: str, name: str) -> Parameter:
 
 
 LUMEN, HEART = "another lumen", "another heartbeat"
-HYPOTHESES: tuple[Hypothesis, ...] = (
-    Differs(
+REGISTRATION, DRIFT = "another registration", "a patient who drifts"
+HYPOTHESES = (
+    Hypothesis(
         "another tip",
-        Parameter("tip_bend_factor", 0.05, 0.25, 0.5, 1.8, "tip bend ×{:.2f} to {:.2f}"),
-        Parameter("tip_bend_length_factor", 0.05, 0.2, 0.6, 1.6, "bent length ×{:.2f} to {:.2f}"),
+        (
+            Parameter("tip_bend_factor", 0.05, 0.25, 0.5, 1.8, "tip bend ×{:.2f} to {:.2f}"),
+            Parameter("tip_bend_length_factor", 0.05, 0.2, 0.6, 1.6, "bent length ×{:.2f} to {:.2f}"),
+        ),
     ),
-    Differs(
+    Hypothesis(
         "another stiffness",
-        Parameter("tip_stiffness_factor", 0.12, 0.4, 0.4, 2.5, "tip stiffness ×{:.2f} to {:.2f}"),
-        Parameter("shaft_stiffness_factor", 0.05, 0.4, 0.4, 2.5, "shaft stiffness ×{:.2f} to {:.2f}"),
+        (
+            Parameter("tip_stiffness_factor", 0.12, 0.4, 0.4, 2.5, "tip stiffness ×{:.2f} to {:.2f}"),
+            Parameter("shaft_stiffness_factor", 0.05, 0.4, 0.4, 2.5, "shaft stiffness ×{:.2f} to {:.2f}"),
+        ),
     ),
-    Differs("another lumen", Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}"), costly=True),
-    CompliantWall("a wall that yields", Parameter("compliance", 0.01, 0.7, 0.0, 1.0, "", factor=False), costly=True),
-    Differs(
+    Hypothesis(LUMEN, (Parameter("lumen_factor", 0.03, 0.1, 0.75, 1.3, "lumen ×{:.2f} to {:.2f}"),), costly=True),
+    Hypothesis("a wall that yields", (Parameter("compliance", 0.01, 0.7, 0.0, 1.0, "", False),), costly=True),
+    Hypothesis(
         "another friction",
-        Parameter("friction_factor", 0.15, 0.6, 0.3, 3.0, "friction ×{:.2f} to {:.2f}"),
+        (Parameter("friction_factor", 0.15, 0.6, 0.3, 3.0, "friction ×{:.2f} to {:.2f}"),),
         of_kind=False,
     ),
-    Differs(
+    Hypothesis(
         "another ostium",
-        Parameter("ostium_mm", 0.3, 2.0, -6.0, 6.0, "wire {:.1f} to {:.1f} mm deeper than by its encoder", False),
+        (Parameter("ostium_mm", 0.3, 2.0, -6.0, 6.0, "wire {:.1f} to {:.1f} mm deeper than by its encoder", False),),
         of_kind=False,
     ),
-    Displaced("another registration", "registration_mm", 0.1, 1.0, 5.0, "registered beside by, mm,"),
-    Displaced("a patient who drifts", "drift_mm_min", 0.05, 1.5, 8.0, "drifts by, mm a minute,"),
-    OtherHeart(
+    Hypothesis(REGISTRATION, _beside("registration_mm", "registered beside by, mm,", 0.1, 1.0, 5.0), of_kind=False),
+    Hypothesis(DRIFT, _beside("drift_mm_min", "drifts by, mm a minute,", 0.05, 1.5, 8.0), of_kind=False),
+    Hypothesis(
         HEART,
-        _of_patients("annulus_mm", "annulus_factor"),
-        _of_patients("heart_volume_share", "heart_volume_factor"),
+        (
+            _of_patients("annulus_mm", "annulus_factor"),
+            _of_patients("heart_volume_share", "heart_volume_factor"),
+        ),
         costly=True,
     ),
 )
@@ -273,10 +254,7 @@ class Family:
 
     def world(self, unit: Float[np.ndarray, "p"], motion: Motion | None = None) -> World:
         """Return what reality is with these parameters, in a vessel that is known to move so."""
-        world, values = World(motion=motion), self.values(unit)
-        for each in self.hypotheses:
-            world = each.world(world, values)
-        return world
+        return _made(World(motion=motion), self.values(unit))
 
     @cached_property
     def _sets(self) -> list[tuple[int, ...]]:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, TransformerConfig
-from endopilot.models.episodes import Episodes, Observed, OpenLoop, Steps2, begin_after, needed
+from endopilot.models.episodes import Episodes, OpenLoop, Steps2, needed
 from endopilot.types import SAMPLE_PERIOD_S
 
 N_FEATURES = 9
@@ -195,23 +195,19 @@ class TransformerPredictor:
 
     def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        return self._rollout(episodes, WINDOW, inverse=False, forward=True)
+        return self._rollout(episodes, inverse=False, forward=True)
 
     def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
         """P2: predict the controls that bring about the true tip."""
-        return self._rollout(episodes, WINDOW, inverse=True, forward=False)
+        return self._rollout(episodes, inverse=True, forward=False)
 
-    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
-        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
-
-        The networks take the last 30 states only; those not observed are as they were predicted at the time.
-        """
-        begin = WINDOW if observed is None else begin_after(observed)
-        return self._rollout(episodes, begin, inverse=True, forward=True)
+    def rollout_dual(self, episodes: Episodes) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to."""
+        return self._rollout(episodes, inverse=True, forward=True)
 
     @torch.inference_mode()
-    def _rollout(self, episodes: Episodes, begin: int, *, forward: bool, inverse: bool) -> OpenLoop:
-        """Roll out from a sample on: controls by IF or the true ones, tips by FF or the true ones."""
+    def _rollout(self, episodes: Episodes, *, forward: bool, inverse: bool) -> OpenLoop:
+        """Roll out after the given states: controls by IF or the true ones, tips by FF or the true ones."""
         networks = (
             needed(self.forward, "forward") if forward else None,
             needed(self.inverse, "inverse") if inverse else None,
@@ -220,18 +216,18 @@ class TransformerPredictor:
         for first in range(0, len(episodes), self.batch_size):
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
             batch = Windows.of(episodes.select(chosen))
-            parts.append(_rollout_batch(*networks, self.limits, batch, begin))
+            parts.append(_rollout_batch(*networks, self.limits, batch))
         tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
 
 def _rollout_batch(
-    forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows, begin: int
+    forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows
 ) -> tuple[Steps2, Steps2, Steps2]:
     desired = batch.tip
     tip, control = desired.clone(), batch.control.clone()
     proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls
-    for k in range(begin, tip.shape[1]):
+    for k in range(WINDOW, tip.shape[1]):
         if inverse is not None:
             wanted = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
             given = slice(k - WINDOW, k)
@@ -242,4 +238,4 @@ def _rollout_batch(
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)
             tip[:, k] = forward(tip[:, k - WINDOW : k], proximal[:, moved].float(), control[:, moved])
-    return tuple(signal[:, begin:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
+    return tuple(signal[:, WINDOW:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]

@@ -1,16 +1,17 @@
-"""The model of simulated wires: rod cores that are weighted by what X-ray showed, and led along desired tips.
+"""The model of simulated wires: rod cores that are weighted by the given tips, and led along desired ones.
 
-A few wires that differ in what is uncertain (`ensemble`) follow the known commands through the samples at which the tip
-was seen. A regression over them says which wire retraces those best, and how surely. Wires around it follow the
-commands to the end: their weighted median is the prediction, their weighted spread its band; where they part the tip
-may jump. There is nothing to train: a vessel and devices are all that the model needs.
+A few wires that differ in what `hypotheses` may be other follow the known commands through the given states; in a
+patient who moves the heart may do so otherwise, too. Breath moves vessel and catheter together, and so no tip in its
+vessel. A regression over them says which wire retraces those states best, and how surely. Wires around it follow the
+commands to the end: their weighted median is the prediction. There is nothing to train: a vessel and devices are all
+that the model needs.
 """
 
 from __future__ import annotations
 
-import hashlib
+import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,27 +19,33 @@ from jaxtyping import Float, Int
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
-from endopilot.models import ensemble
 from endopilot.models.config import WINDOW
-from endopilot.models.ensemble import FAMILY, NARROWEST, SCALES_MM, Members, Paths
-from endopilot.models.episodes import (
-    EachObserved,
-    Episodes,
-    EpisodeSetUp,
-    Observed,
-    OpenLoop,
-    Prediction,
-    Steps2,
-    begin_after,
-    given_states,
-    jumps,
+from endopilot.models.episodes import Episodes, OpenLoop, Steps2
+from endopilot.models.hypotheses import (
+    DRIFT,
+    HYPOTHESES,
+    LUMEN,
+    MEDIAN_SQUARE,
+    REGISTRATION,
+    Family,
+    Posterior,
+    likelihoods,
+    log_likelihood,
 )
-from endopilot.models.hypotheses import Posterior
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
+from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
+FAMILY = Family([each for each in HYPOTHESES if each.name not in (LUMEN, REGISTRATION, DRIFT)])
+"""What members differ in; a lumen of their own would need a map of the vessel each, and tips along a vessel show no
+registration."""
+SCALES_MM = np.array([0.05, 0.025])
+"""Scales of a good wire's error in Δtip and γtip where the tip is known exactly, mm."""
+NARROWEST = 0.1
+"""Members are spread over this share of what is usual at least."""
 GENERATIONS = 2
 """Times that wires are tried through what was seen; those of the next are drawn around the best of the last."""
 TRIED, FOLLOWED = (8, 4), (2, 4)
@@ -48,6 +55,8 @@ TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
 """Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
 ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
 """Rotations that are tried with each."""
+Paths = Float[np.ndarray, "members episodes samples 2"]
+"""(Δtip, γtip) of each member at each sample, mm; NaN from where its simulation fails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,142 +64,144 @@ class SimulatedWires:
     """The rod core as a predictor of whatever devices episodes have.
 
     Attributes:
-        identified: what is believed after what was seen of given states, by setup and by a digest of patient, commands
-            and tips; all protocols and later plans share it.
-        tracked: controls that lead the tip along the desired one from the given states on; P2 and P3 share them.
+        identified: what is believed after the given states of episodes, by anatomy; all protocols share it.
+        tracked: controls that lead the tip along the desired one; P2 and P3 share them.
     """
 
-    identified: WeakKeyDictionary[EpisodeSetUp, dict[bytes, Posterior]] = field(
+    identified: WeakKeyDictionary[Episodes, dict[str, list[Posterior]]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
-        """Predict the tips of episodes from their commands and from the observed tips.
-
-        Args:
-            episodes: their commands, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed, of all episodes alike or of each.
-        """
-        seen = np.broadcast_to(observed, episodes.branch.shape)
-        paths, tips, sd_mm = self.paths(episodes, seen), episodes.tip.astype(float), episodes.tip_sd.astype(float)
-        tip, spread = ensemble.weigh(paths, tips, seen, sd_mm)
-        weight = ensemble.weights(paths, tips, seen, sd_mm)
-        jumping = np.array([jumps(each[..., 0], episodes.proximal[..., 0].astype(float)) for each in paths])
-        return Prediction(tip, spread, np.einsum("me,mes->es", weight, jumping))
-
-    def paths(self, episodes: Episodes, seen: EachObserved) -> Paths:
-        """Return the tips, mm, of the wires that are likely after the seen ones; NaN from where a simulation fails.
-
-        `ensemble.weigh` makes a prediction of them, and again, without another simulation, when more tips are seen.
-        """
-        found = np.full((1 + np.prod(FOLLOWED), *episodes.tip.shape), np.nan)
-        for anatomy, chosen in _by_anatomy(episodes):
-            data = episodes.select(chosen)
-            believed, least = self._identified(anatomy, data, seen[chosen]), np.diag(NARROWEST * FAMILY.usual)
-            around = [FAMILY.drawn(each.center, each.factor + least, *FOLLOWED) for each in believed]
-            members = np.stack([np.concatenate([e.center[None], m]) for e, m in zip(believed, around, strict=True)], 1)
-            found[:, chosen] = _replayed(anatomy, data, members, data.samples)
-        return found
-
     def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        later = slice(WINDOW, None)
-        tip = self.predict(episodes, given_states(episodes)).tip[:, later]
-        return OpenLoop(tip, episodes.proximal[:, later].astype(float), episodes.control[:, later].astype(float))
+        tip, least = np.empty((*episodes.tip[:, WINDOW:].shape,)), np.diag(NARROWEST * FAMILY.usual)
+        for chosen, anatomy, data, believed in self._believed(episodes):
+            around = [FAMILY.drawn(each.center, each.factor + least, *FOLLOWED) for each in believed]
+            members = np.stack([np.concatenate([e.center[None], m]) for e, m in zip(believed, around, strict=True)], 1)
+            paths = _replayed(anatomy, data, members, data.tip.shape[1])
+            weight = weights(paths[:, :, :WINDOW], data.tip[:, :WINDOW].astype(float))
+            tip[chosen] = weighted_median(paths[:, :, WINDOW:], weight)
+        given = (each[:, WINDOW:].astype(float) for each in (episodes.proximal, episodes.control))
+        return OpenLoop(tip, *given)
 
     def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
         """P2: predict the controls that bring about the true tip."""
-        found = self.rollout_dual(episodes)
-        return OpenLoop(tip=episodes.tip[:, WINDOW:].astype(float), proximal=found.proximal, control=found.control)
+        return replace(self.rollout_dual(episodes), tip=episodes.tip[:, WINDOW:].astype(float))
 
-    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Episodes) -> OpenLoop:
         """P3: predict the controls that bring about the true tip, and the tip that they lead to.
 
-        The wire that retraces the observed tips best is led along the desired ones, one sample at a time: see `track`.
+        The wire that retraces the given tips best is led along the desired ones, one sample at a time: see `track`.
         """
-        if observed is not None:
-            return self._led(episodes, observed)
-        if episodes not in self.tracked:
-            self.tracked[episodes] = self._led(episodes, given_states(episodes))
-        return self.tracked[episodes]
-
-    def _led(self, episodes: Episodes, observed: Observed) -> OpenLoop:
-        """Return the controls that lead each episode's best wire along the desired tips after the last observed one."""
-        begin = begin_after(observed)
-        desired = episodes.tip[:, begin:].astype(float)
+        if episodes in self.tracked:
+            return self.tracked[episodes]
+        desired = episodes.tip[:, WINDOW:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
-        for anatomy, chosen in _by_anatomy(episodes):
-            data = episodes.select(chosen)
-            believed = self._identified(anatomy, data, np.broadcast_to(observed, data.branch.shape))
-            best, stack = [FAMILY.world(each.center) for each in believed], Stack.of(data.setup.device)
+        for chosen, anatomy, data, believed in self._believed(episodes):
+            best, stack = [FAMILY.world(each.center) for each in believed], Stack.of(data.device)
             tip[chosen], control[chosen] = track(
                 anatomy,
                 [each.stack(stack) for each in best],
-                friction=ensemble.frictions(stack, np.array([each.friction_factor for each in best])),
-                start=ensemble.as_deep(data.start, np.array([each.ostium_mm for each in best])),
+                friction=stack.frictions(stack.wire.friction * np.array([each.friction_factor for each in best])),
+                start=_as_deep(data.start, np.array([each.ostium_mm for each in best])),
                 command=data.command,
                 desired=desired[chosen],
-                config=data.setup.simulator,
-                motion=data.setup.known_motions.get(anatomy.name),
+                config=data.simulator,
+                motion=data.known_motions.get(anatomy.name),
             )
-        start = episodes.proximal[:, begin - 1 : begin].astype(float)
-        return OpenLoop(tip=tip, proximal=start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control=control)
+        start = episodes.proximal[:, WINDOW - 1 : WINDOW].astype(float)
+        proximal = start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
+        self.tracked[episodes] = OpenLoop(tip=tip, proximal=proximal, control=control)
+        return self.tracked[episodes]
 
-    def _identified(self, anatomy: Anatomy, data: Episodes, seen: EachObserved) -> list[Posterior]:
-        """Return what is believed of episodes of one anatomy after what was seen of the given states."""
-        known, seen = self.identified.setdefault(data.setup, {}), seen[:, :WINDOW]
-        digests = [_digest(data, i, seen[i]) for i in range(len(data))]
-        new = np.array([i for i, digest in enumerate(digests) if digest not in known], dtype=int)
-        if len(new):
-            for i, found in zip(new, _identify(anatomy, data.select(new), seen[new]), strict=True):
-                known[digests[i]] = found
-        return [known[digest] for digest in digests]
-
-
-def _digest(data: Episodes, i: int, seen: Observed) -> bytes:
-    """Return what identifies an episode's patient, its commands and what was seen of its first samples."""
-    given = slice(len(seen))
-    signals = (
-        data.start[i],
-        data.command[i, given],
-        np.packbits(seen),
-        data.tip[i, given][seen],
-        data.tip_sd[i, given],
-    )
-    return hashlib.sha256(b"\0".join([str(data.anatomy[i]).encode(), *(part.tobytes() for part in signals)])).digest()
+    def _believed(
+        self, episodes: Episodes
+    ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Anatomy, Episodes, list[Posterior]]]:
+        """Yield the episodes of each anatomy, and what is believed of them after the given states."""
+        known = self.identified.setdefault(episodes, {})
+        for name in np.unique(episodes.anatomy).tolist():
+            chosen, anatomy = np.flatnonzero(episodes.anatomy == name), episodes.anatomies[name]()
+            data = episodes.select(chosen)
+            if name not in known:
+                known[name] = _identify(anatomy, data)
+            yield chosen, anatomy, data, known[name]
 
 
-def _identify(anatomy: Anatomy, data: Episodes, seen: EachObserved) -> list[Posterior]:
-    count, size = len(data), len(FAMILY.parameters)
-    found = [FAMILY.as_given()] * count
-    samples = int(np.nonzero(seen)[1].max(initial=-1)) + 1
-    tips, scale = data.tip[:, :samples].astype(float), np.maximum(SCALES_MM, data.tip_sd[:, :samples].astype(float))
+def _identify(anatomy: Anatomy, data: Episodes) -> list[Posterior]:
+    count, size, found = len(data), len(FAMILY.parameters), list[Posterior]()
+    tips = data.tip[:, :WINDOW].astype(float)
+    scale = np.broadcast_to(SCALES_MM, tips.shape[1:])
     center, spread = np.zeros((count, size)), np.ones((count, size))
-    for generation in range(GENERATIONS if samples else 0):
+    for generation in range(GENERATIONS):
         each = zip(center, spread, strict=True)
         members = np.stack([FAMILY.drawn(c, np.diag(s), *TRIED, seed=generation) for c, s in each], axis=1)
-        paths = _replayed(anatomy, data, members, samples)
-        found = [
-            FAMILY.update(members[:, k], paths[:, k, at], tips[k, at], scale[k, at], noisy=True)
-            for k, at in enumerate(seen[:, :samples])
-        ]
+        paths = _replayed(anatomy, data, members, WINDOW)
+        found = [FAMILY.update(members[:, k], paths[:, k], tips[k], scale, noisy=True) for k in range(count)]
         center = np.array([each.mean for each in found])
         spread = np.clip([2 * each.sd for each in found], NARROWEST, 1.0)
     return found
 
 
-def _replayed(anatomy: Anatomy, data: Episodes, members: Members, samples: int) -> Paths:
-    setup = data.setup
-    return ensemble.replay(
-        anatomy,
-        Stack.of(setup.device),
-        members,
-        start=data.start,
-        command=data.command[:, :samples],
-        config=setup.simulator,
-        motion=setup.known_motions.get(anatomy.name),
-    )
+def _replayed(
+    anatomy: Anatomy, data: Episodes, members: Float[np.ndarray, "members episodes p"], samples: int
+) -> Paths:
+    """Drive every member, given its parameters of `FAMILY`, from the start of each episode as the robot was commanded,
+    for some samples."""
+    count, episodes, size = members.shape
+    stack, motion = Stack.of(data.device), data.known_motions.get(anatomy.name)
+    worlds = [FAMILY.world(each, motion) for each in members.reshape(-1, size)]
+    starts = _as_deep(np.tile(data.start, (count, 1, 1)), np.array([each.ostium_mm for each in worlds]))
+    commands = np.tile(data.command[:, :samples], (count, 1, 1, 1)).astype(float)
+    made = np.full((len(worlds), samples, 2), np.nan)
+    friction = stack.frictions(stack.wire.friction * np.array([each.friction_factor for each in worlds]))
+    alike = [replace(each, friction_factor=1.0, ostium_mm=0.0) for each in worlds]
+    devices = {each: each.stack(stack) for each in alike}  # members of one kind share the processor's lanes
+    cores = [(each.motion, each.core(data.simulator)) for each in worlds]
+    for core in dict.fromkeys(cores):
+        rows = np.array([k for k, each in enumerate(cores) if each == core])
+        set_up = SimulationSetUp(
+            anatomies=[anatomy] * len(rows),
+            stacks=[devices[alike[k]] for k in rows],
+            initial=starts[rows],
+            friction=friction[rows],
+            actuation="velocity",
+            motion=core[0],
+            config=core[1],
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a member that fails is left out
+            run = run_set_up(set_up, commands[rows], period_s=SAMPLE_PERIOD_S, record_shape=False)
+        tip = run.tip[:, :, 0]
+        made[rows] = np.where(run.valid[..., None], np.stack([tip.abscissa, tip.offset], axis=-1), np.nan)
+    return made.reshape(count, episodes, -1, 2)
+
+
+def _as_deep(
+    start: Float[np.ndarray, "n devices 2"], ostium_mm: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n devices 2"]:
+    """Return starts of devices that lie so much deeper than the encoders have it, mm."""
+    return np.stack([np.maximum(start[..., 0] + ostium_mm[:, None], 0.0), start[..., 1]], axis=-1)
+
+
+def weights(paths: Paths, tips: Float[np.ndarray, "episodes samples 2"]) -> Float[np.ndarray, "members episodes"]:
+    """Return how likely the members are: the product of Cauchy densities of their errors at the tips that were seen.
+
+    Heavy tails, because a snap that comes a moment too early errs by a millimetre and says little about friction. The
+    scale is no smaller than what the best member leaves unexplained, such as in a world that no member is like.
+    """
+    error = np.nan_to_num(np.abs(paths - tips), nan=1e3)
+    misfit = np.median(error, axis=2).min(axis=0) / np.sqrt(MEDIAN_SQUARE)
+    return likelihoods(log_likelihood(error, np.maximum(SCALES_MM, misfit[:, None])).sum(axis=(2, 3)))
+
+
+def weighted_median(paths: Paths, weight: Float[np.ndarray, "members episodes"]) -> Steps2:
+    """Return the weighted median of the members' tips, mm; NaN where none is left."""
+    share = np.where(np.isfinite(paths), weight[:, :, None, None], 0.0)
+    total, order = share.sum(axis=0), np.argsort(paths, axis=0)  # NaN last
+    reached = np.cumsum(np.take_along_axis(share, order, axis=0), axis=0) >= 0.5 * total
+    middle = np.take_along_axis(paths, np.take_along_axis(order, reached.argmax(axis=0)[None], axis=0), axis=0)[0]
+    return np.where(total > 0, middle, np.nan)
 
 
 def track(
@@ -248,8 +259,3 @@ def track(
         control[:, k] = moved[best, 0] - slip / SAMPLE_PERIOD_S
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control
-
-
-def _by_anatomy(episodes: Episodes) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:
-    for name in np.unique(episodes.anatomy):
-        yield episodes.setup.anatomies[str(name)](), np.flatnonzero(episodes.anatomy == name)

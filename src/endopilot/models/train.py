@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from endopilot import __version__
-from endopilot.dataset.loader import Dataset, read_joined
+from endopilot.dataset.loader import read_joined
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
 from endopilot.models.checkpoint import (
@@ -67,8 +67,9 @@ def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, con
     folders = [Path(each) for each in ([dataset] if isinstance(dataset, str | Path) else dataset)]
     data = read_joined(folders)
     claim(run, "endopilot train", config=config, dataset=data.manifest["key"], version=__version__)
-    training = windows_of(data, "train")
-    validation = windows_of(data, "seen_test") if "seen_test" in data.split else None
+    training, validation = Windows.of(Episodes.of_dataset(data.of_split("train"))), None
+    if "seen_test" in data.split:
+        validation = Windows.of(Episodes.of_dataset(data.of_split("seen_test")))
     start, results = time.perf_counter(), {}
     for name in config.networks:
         network, results[name] = Job(name, config, training, validation, run).run()
@@ -90,20 +91,6 @@ def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, con
         wall_seconds=time.perf_counter() - start,
     )
     write_json(run / "manifest.json", record)
-
-
-def windows_of(dataset: Dataset, split: str) -> Windows:
-    """Return the episodes of a split, which must be finite: one bad sample would spoil the scales of all."""
-    chosen = dataset.of_split(split)
-    for name in ("tip_abscissa", "tip_offset", "inserted_length", "rotation", "control"):
-        finite = np.isfinite(getattr(chosen, name)).reshape(len(chosen), -1).all(axis=1)
-        if not finite.all():
-            bad = int(np.argmin(finite))
-            raise InputError(
-                f"{dataset.folder}: {name} of {chosen.anatomy[bad]}, sequence {chosen.sequence[bad]}, is not finite "
-                "though the episode is marked valid; make the dataset again"
-            )
-    return Windows.of(Episodes.of_dataset(chosen))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
 from endopilot.imaging.overlay_picture import draw_slices
-from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION
+from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
 from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
 
@@ -26,7 +26,6 @@ SERIES_STYLE: dict[str, dict] = {
     "P2": {"color": BLUE},
     "P3": {"color": ORANGE},
     "P4": {"color": VERMILLION},
-    "P4_replanned": {"color": PURPLE},
     "P2_replayed": {"color": SKY},
     "hold_slack": {"color": GREY, "linestyle": "--"},
     "training_mean": {"color": GREY, "linestyle": ":"},
