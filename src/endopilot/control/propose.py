@@ -20,11 +20,7 @@ def propose_devices(navigation: Navigation, *, seconds: float = 60.0) -> str:
     """Return the first shipped devices, and their tip, that a search brings to the target; empty if it finds none.
 
     The wire with a tip for the forks of the route comes first, then the other wires, then the wire in each catheter.
-    They are simulated as given: reality may differ.
-
-    Args:
-        navigation: that was given up, with the time that there was.
-        seconds: wall time for all searches, s, of which each has a quarter at most.
+    They are simulated as given: reality may differ. All searches take so much wall time, s, each a quarter at most.
     """
     until = time.perf_counter() + seconds
     for stack in _stacks(navigation):
