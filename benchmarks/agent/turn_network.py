@@ -20,9 +20,8 @@ from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import make_patient
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.cloned import NETWORK
-from endopilot.control.drive import Driver, Goal, Limits, Outcome
+from endopilot.control.drive import Driver, Goal, Limits, Outcome, SearchConfig
 from endopilot.control.repertoire import Row, sides, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import SPARE_SHARE
 from endopilot.control.trials import Trials
 from endopilot.control.turn_network import AZIMUTH, FEATURES, ForkView, TurnNetwork, fourier

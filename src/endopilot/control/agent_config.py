@@ -9,7 +9,7 @@ from typing import Annotated
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import BeliefConfig
 from endopilot.belief.thought import Pace
-from endopilot.control.search_config import SearchConfig
+from endopilot.control.drive import SearchConfig
 from endopilot.errors import InputError
 from endopilot.settings import Positive, Within, settings
 from endopilot.tasks.navigation import Navigation, XrayKind

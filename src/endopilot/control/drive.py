@@ -8,14 +8,14 @@ some lead, or the wire waits in it; soft devices keep what they are driven with.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.course import Controls
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Control, Each, Trials
+from endopilot.settings import Positive, Seconds, Within, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 
@@ -43,6 +43,24 @@ _CATHETER_SHARE = 0.5
 _MISS_MM, _FORCE_MM, _SLACK, _MM_S = 10.0, 8.0, 0.05, 0.1
 """What it costs to leave all wires before the place and to press with the whole force limit, mm, what a millimetre of
 slack costs, and what a second, mm/s."""
+
+
+@settings
+class SearchConfig:
+    """How fast devices are moved in a search, and how a catheter follows its wire; `motions.yaml` has what is tried."""
+
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
+    """Translation of a device that is pushed straight on, mm/s."""
+    turn_rad_s: Annotated[float, Within(0.01, 1000)] = 7.0
+    """Fastest rotation that is tried, rad/s."""
+    lead_mm: Positive = 4.0
+    """Devices are turned this far before a junction, mm, or 1.4 lumen radii where that is more."""
+    behind_mm: Positive = 10.0
+    """The catheter follows to this far behind the wire's tip, mm, except to the target if its own tip is to arrive."""
+    together: bool = False
+    """The wire goes on while its catheter follows, instead of resting: in half the time."""
+    longest_s: Seconds = 30.0
+    """A motion that leads past a place takes this much longer than twice the way at full speed at most, s."""
 
 
 class Motions(NamedTuple):

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from endopilot.control.drive import Driver, Goal
+from endopilot.control.drive import Driver, Goal, SearchConfig
 from endopilot.control.repertoire import Repertoire, Row, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import Trials
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits

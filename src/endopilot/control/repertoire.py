@@ -10,8 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from endopilot.control.drive import Each, Limits, Motions
-from endopilot.control.search_config import SearchConfig
+from endopilot.control.drive import Each, Limits, Motions, SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Control
 from endopilot.files import read_yaml
 from endopilot.settings import Finite, NonNegative, Positive, Share, Within, settings

@@ -18,9 +18,8 @@ import numpy as np
 from endopilot.belief.belief import Belief
 from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.control.course import Course, places_of
-from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Motions, Outcome
+from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Motions, Outcome, SearchConfig
 from endopilot.control.repertoire import Repertoire, Row, Table, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import describe_halt
 from endopilot.control.trials import Trials
 from endopilot.progress import Advance
