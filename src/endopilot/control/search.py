@@ -183,6 +183,10 @@ class Search:
                 if self._follow(outcome, goal, row, row.force * limit_n, number):
                     return None
         course.restore(self._kept)
+        straight = tried[repertoire.rows[0]]
+        farthest = int(np.argmax(straight.farthest))
+        if straight.periods[farthest] >= self._left:  # it leads on as far as there is time
+            self._repeat(straight, farthest, pauses=True)
         return halt
 
     def _drive(self, row: Row, goal: Goal) -> Iterator[Outcome]:
@@ -216,13 +220,14 @@ class Search:
         passes = gentle & (outcome.share >= agree - ROUNDING)
         cost = outcome.expected_cost(limit_n)
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
-            self._repeat(outcome, trial)
-            there, done = goal.passed(course) * course.weight, course.rows[len(self._kept.rows) :]
-            pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
-            enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
-            if enough and pressed <= force_n:
-                course.weight = there / there.sum()
-                return True
+            for pauses in (False, True):
+                self._repeat(outcome, trial, pauses=pauses)
+                there, done = goal.passed(course) * course.weight, course.rows[len(self._kept.rows) :]
+                pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
+                enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
+                if enough and pressed <= force_n:
+                    course.weight = there / there.sum()
+                    return True
         course.restore(self._kept)
         if row.draws is None or not gentle.any():
             return False
@@ -230,14 +235,14 @@ class Search:
         left = np.where(gentle, outcome.left_mm, np.inf)
         if left.min() > start - row.draws.step_mm:
             return False
-        self._repeat(outcome, int(np.argmin(left)), row.draws.kept)
+        self._repeat(outcome, int(np.argmin(left)), pauses=True, most=row.draws.kept)
         return True
 
-    def _repeat(self, outcome: Outcome, trial: int, most: int | None = None) -> None:
-        """Let the course do what a trial did, without the periods in which nothing moved."""
+    def _repeat(self, outcome: Outcome, trial: int, *, pauses: bool, most: int | None = None) -> None:
+        """Let the course do what a trial did, with or without the periods in which nothing moves."""
         self._course.restore(self._kept)
         for control in outcome.controls_of(trial)[:most]:
-            if control.any():
+            if pauses or control.any():
                 self._course.move(control[None])
 
     def _obstacle(self, place: float) -> tuple[float, float]:
