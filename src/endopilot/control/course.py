@@ -126,22 +126,31 @@ class Follower:
             raise ValueError("the course has ended")
         self.shows = False
         course, drives, at = self.course, self._drives, self.at
-        wanted, control = course.proximal[at], np.abs(course.control[at])
+        wanted = course.proximal[at]
         if drives.lose:
             held = self._settle(course)
             if held is not None:
                 return held
-            if control[:, 0].max() < _STILL:  # where devices only turn, they do the shorter way
-                turn = wanted[:, 1] + self._whole_turns[:, 1]
-                self._whole_turns[:, 1] += drives.nearest_turn(turn) - turn
-            wanted = wanted + self._whole_turns
-            wanted[:, 1] = np.where(control[:, 1] < _STILL, drives.at_rest[:, 1], wanted[:, 1])  # by `_OFF_RAD` at most
+            at = self._end_of_turn(course)
+            wanted = course.proximal[at] + self._whole_turns
+            unturned = (np.abs(course.control[at, :, 1]) < _STILL) & (at == self.at)
+            wanted[:, 1] = np.where(unturned, drives.at_rest[:, 1], wanted[:, 1])  # off by less than `_OFF_RAD`
         motion = drives.towards(wanted, self._fastest)
         if motion.done:
             self.shows, self.at, self._settled = bool(course.exposed[at]), at + 1, 0
             if np.abs(motion.velocity[0, 1]) > _TURNED_RAD_S:
                 self._looked = 0
         return motion.commands
+
+    def _end_of_turn(self, course: Course) -> int:
+        """Return the last of the periods in which devices only turn, which they do the shorter way, or the next."""
+        still = np.abs(course.control[self.at :, :, 0]).max(axis=1) < _STILL
+        if not still[0]:
+            return self.at
+        at = self.at + (len(still) if still.all() else int(np.argmin(still))) - 1
+        turn = course.proximal[at, :, 1] + self._whole_turns[:, 1]
+        self._whole_turns[:, 1] += self._drives.nearest_turn(turn) - turn
+        return at
 
     def _settle(self, course: Course) -> Proximals | None:
         """Return velocities by which the wire rests to be looked at, or is turned; None where it may go on."""
