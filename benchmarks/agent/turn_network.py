@@ -20,11 +20,10 @@ from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import make_patient
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.cloned import NETWORK
-from endopilot.control.drive import Driver, Goal, Limits, Outcome
+from endopilot.control.drive import Driver, Goal, Limits, Outcome, SearchConfig
 from endopilot.control.repertoire import Row, sides, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import SPARE_SHARE
-from endopilot.control.trials import WIRE, Move, Trials
+from endopilot.control.trials import Trials
 from endopilot.control.turn_network import AZIMUTH, FEATURES, ForkView, TurnNetwork, fourier
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
@@ -165,7 +164,7 @@ class Forks:
                 rows.append((view.features, azimuth, passed))
                 if passed.any() and self._follow(outcome, int(self._random.choice(np.flatnonzero(passed))), waypoint):
                     break
-                self._one.move(self._one.control(Move(WIRE, -self._random.uniform(2.0, 8.0) / DECISION_PERIOD_S)))
+                self._one.move(self._one.control(-self._random.uniform(2.0, 8.0) / DECISION_PERIOD_S))
             else:
                 break
         return rows
@@ -186,7 +185,7 @@ class Forks:
                 break
             speed = np.clip(gap / DECISION_PERIOD_S, -self._config.speed_mm_s, self._config.speed_mm_s)
             one.still[:] = False
-            presses = one.move(one.control(Move(WIRE, float(speed))), force_n=limit_n).any()
+            presses = one.move(one.control(float(speed)), force_n=limit_n).any()
             if presses or (speed > 2.0 and float(route.progress(one.foremost)[0]) - progress < 0.3):
                 break
         return fork
@@ -197,7 +196,7 @@ class Forks:
         limit_n = self._navigation.force_limit_n
         for _ in range(TURN_PERIODS):
             rotation = sides(TURNS) / (TURN_PERIODS * DECISION_PERIOD_S)
-            many.still |= many.move(many.control(Move(WIRE, rotation=rotation)), force_n=limit_n)
+            many.still |= many.move(many.control(turn=rotation), force_n=limit_n)
         views = (ForkView.of(self._route, place, nodes, self._navigation.device) for nodes in many.simulator.position)
         azimuth = np.array([view.azimuth for view in views])
         motions = Row(follow_mm=(0.0,) * TURNS).motions(place, 0.0, self._config, 1, self._random)

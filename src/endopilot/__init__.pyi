@@ -18,7 +18,6 @@ from .control.plan_config import PlanConfig as PlanConfig
 from .control.plan_xray import PlannedXray as PlannedXray
 from .control.plan_xray import plan_xray as plan_xray
 from .control.reach import Fork as Fork
-from .control.search_config import Cost as Cost
 from .control.set_up import TipChoice as TipChoice
 from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset

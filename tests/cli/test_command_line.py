@@ -277,15 +277,13 @@ def test_a_file_can_be_started_from_flags(tmp_path, capsys, monkeypatch) -> None
     """On a real command, through the command line: what is required may be left out, and flags are printed too."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as leaving:
-        main(["plan", "--tip-weight", "0.3", "--print-config"])
+        main(["plan", "--speed-mm-s", "5", "--print-config"])
     printed = capsys.readouterr().out
     assert leaving.value.code == 0
-    assert (
-        "# Tip error before the end, 1/s.\n  tip_weight: 0.3\n" in printed and "# target: TEXT  (required)" in printed
-    )
+    assert "straight push, mm/s.\nspeed_mm_s: 5.0\n" in printed and "# target: TEXT  (required)" in printed
     Path("plan.yaml").write_text(printed)
     again = command_of("plan").read(["patient", "--target", "4", "-o", "o", "--config", "plan.yaml"])
-    assert again.cost.tip_weight == 0.3 and again.target == "4"
+    assert again.speed_mm_s == 5.0 and again.target == "4"
 
 
 def test_the_pages_are_made_of_the_commands() -> None:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.control.drive import Driver, Goal, Limits, Motions, Outcome
+from endopilot.control.drive import Driver, Goal, Limits, Motions, Outcome, SearchConfig
 from endopilot.control.repertoire import Draws, Repertoire, Row, read_table, sides
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Trials
 from endopilot.devices.catheter import read_catheter
 from endopilot.simulation.world import World

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from endopilot.control.navigate import NavigateConfig, navigate
+from endopilot.control.navigate import NavigateConfig, navigate, propose_devices
 from endopilot.control.outcome import decision_times, tell_outcome
-from endopilot.control.propose import propose_devices
 from endopilot.tasks.targets import find_target
 
 

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Course, places_of
 from endopilot.control.search import Search
 from endopilot.control.trials import CATHETER, WIRE
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
-from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
@@ -131,17 +130,6 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
     assert policy.decide(seen(8.0, sd_mm=4.0)).devices[0][0] >= 0 and policy.plans == 1  # a poor image proves little
 
 
-def test_the_oracle_looks_always_and_a_plan_is_followed_without_a_look(side_branch) -> None:
-    truth, config = World(friction_factor=1.2, ostium_mm=0.5), agent_config(side_branch)
-    record = NavigationLoop(
-        side_branch, OraclePolicy(truth, config), config=LoopConfig(simulator=CORE), world=truth
-    ).run()
-    assert record.reason == "reached" and record.safe and record.exposures == len(record.time_s) - 1
-    near = replace(side_branch, target=Target(branch=0, abscissa=16.0))
-    record = NavigationLoop(near, OpenLoopPolicy(config=config), config=LoopConfig(simulator=CORE)).run()
-    assert record.reason == "reached" and record.exposures == 1
-
-
 def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     policy = AgentPolicy(agent_config(side_branch))
     loop = NavigationLoop(side_branch, policy, config=LoopConfig(simulator=CORE), seed=2)
@@ -156,14 +144,6 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
         loop.step()
     record = loop.record()
     assert record.reason == "reached" and record.safe and record.exposed[5]
-
-
-def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
-    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_length_mm=14.0)
-    result = attempt("agent", beside, seed=1)
-    events, missed = result["events"]
-    assert result["success"] and 0 <= missed <= events
-    assert repeat(Recording.unpacked(result["recording"], devices=2), beside, seed=1)["events"] == result["events"]
 
 
 def test_the_agent_drives_one_catheter(side_branch) -> None:

@@ -35,14 +35,6 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     assert side_branch.reached(simulator.project())[0]
 
 
-def test_a_wire_without_a_bend_finds_no_way_into_the_branch(side_branch) -> None:
-    """However many motions are drawn, a path that no wire follows is none."""
-    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
-    policy = OraclePolicy(config=QUICK)
-    policy.start(replace(side_branch, device=straight), 0)
-    assert policy.find_course(20.0).reached == 0.0 and "does not enter" in policy.halt
-
-
 def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
     """A wire that meets its limits where no branch leaves does not need a larger bend."""
     route = Route.to(side_branch.anatomy, side_branch.target)

@@ -10,7 +10,7 @@ import pytest
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import IN_WIDE_LUMEN, AgentConfig
-from endopilot.control.trials import WIRE, Move, Trials
+from endopilot.control.trials import WIRE, Trials
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm
@@ -74,5 +74,5 @@ def test_a_control_leaves_no_travel_after_its_period(aorta, started):
     trials = Trials(
         Trials.of(aorta, [(aorta.anatomy, aorta.stack)], 1, like=started.belief.simulator).simulator, [limits]
     )
-    control = trials.possible(trials.control(Move(WIRE, 30.0)))
+    control = trials.possible(trials.control(30.0))
     assert control[0, WIRE, 0] == pytest.approx(6.0 / DECISION_PERIOD_S)

@@ -140,7 +140,7 @@ def simulate_command(
 def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
     """Return what a plan's folder or a file holds; devices that are asked for must be its own."""
     if path.is_dir():
-        return read_plan(path, patient, asked).trajectory
+        return read_plan(path, patient, asked)
     recorded = read_trajectory(path, anatomy=patient)
     if asked is not None and any(stack.constants != asked.constants for stack in recorded.set_up.stacks):
         made_with = recorded.set_up.stacks[0].name

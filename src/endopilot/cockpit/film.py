@@ -93,7 +93,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         raise InputError(f"{path}: give the patient's folder too: endopilot cockpit PATIENT --replay {path}")
     vessel = read_anatomy(patient)
     if (path / "plan.csv").exists():
-        return _of_trajectory(read_plan(path, vessel).trajectory, 0, f"plan {path.name}")
+        return _of_trajectory(read_plan(path, vessel), 0, f"plan {path.name}")
     trajectory = read_trajectory(recorded, anatomy=vessel)
     worlds = len(trajectory.valid)
     if not 0 <= world < worlds:

@@ -20,8 +20,9 @@ from endopilot.belief.states import State
 from endopilot.belief.thought import Budget, Thought
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.control.course import Course, Follower
-from endopilot.control.search import Search, check_devices
+from endopilot.control.search import Search
 from endopilot.devices.stack import Proximals
+from endopilot.errors import InputError
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.progress import Advance
 from endopilot.simulation.world import World
@@ -51,11 +52,7 @@ class _PlanningPolicy:
     """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
-        """Take the settings.
-
-        Args:
-            config: search and belief; if not given, those for the navigation's devices.
-        """
+        """Take search and belief; if not given, those for the navigation's devices."""
         self._given_config = config
 
     def _monitored(self) -> Monitor:
@@ -78,7 +75,8 @@ class _PlanningPolicy:
             self.route = self.route.beyond_carinas()
         for device in navigation.devices:
             check_passable(self.route, device)
-        check_devices(navigation)
+        if len(navigation.catheters) > 1:
+            raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
         self.monitor, self._seed = self._monitored(), seed
         self.belief, self._believed = self.monitor.belief, BelievedTip(np.nan, np.nan)
         self._back_mm, self._arrived, self._shows = np.inf, False, False
@@ -115,13 +113,7 @@ class _PlanningPolicy:
         return self.belief.wires
 
     def find_course(self, seconds: float, advance: Advance | None = None, *, horizon_mm: float = np.inf) -> Course:
-        """Search a course from where the likeliest devices are.
-
-        Args:
-            seconds: time that is left, s.
-            advance: called with every millimetre along the route.
-            horizon_mm: the course may end when it leads so far on, mm.
-        """
+        """Search a course from where the likeliest devices are; the arguments are those of `Search.find`."""
         return self._search.find(self.belief, seconds=seconds, horizon_mm=horizon_mm, advance=advance)
 
     @property
@@ -283,12 +275,8 @@ class OraclePolicy(_PlanningPolicy):
     """Plans in the rod core with the true parameters, X-ray always on: the upper bound of what a model can do."""
 
     def __init__(self, world: World | None = None, config: AgentConfig | None = None) -> None:
-        """Take the true parameters.
-
-        Args:
-            world: what reality is, of which wire, catheters, vessel and ostium are simulated; as the navigation says
-                if not given.
-            config: search and belief; if not given, those for the navigation's devices.
+        """Take the true parameters: reality, of which wire, catheters, vessel and ostium are simulated; as the
+        navigation says if not given.
         """
         super().__init__(config)
         self._world = world or World()
@@ -333,9 +321,8 @@ class AgentPolicy(_PlanningPolicy):
 
         Args:
             config: search and belief; if not given, those for the navigation's devices.
-            calibration: of the bands around what the simulated wires predict, by which `Watch` asks for
-                X-ray; if not given, the package's own for the navigation's X-ray and devices, which
-                `python -m benchmarks agent-calibration` makes.
+            calibration: of the bands around what the simulated wires predict; if not given, the package's own for the
+                navigation's X-ray and devices, which `python -m benchmarks agent-calibration` makes.
             advice: which events the adviser watches for.
         """
         super().__init__(config)

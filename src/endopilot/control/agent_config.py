@@ -9,7 +9,7 @@ from typing import Annotated
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import BeliefConfig
 from endopilot.belief.thought import Pace
-from endopilot.control.search_config import SearchConfig
+from endopilot.control.drive import SearchConfig
 from endopilot.errors import InputError
 from endopilot.settings import Positive, Within, settings
 from endopilot.tasks.navigation import Navigation, XrayKind
@@ -66,21 +66,12 @@ class AgentConfig:
         wide = Route.to(navigation.anatomy, navigation.target).is_wide(target)
         if not navigation.catheters:
             return IN_WIDE_LUMEN if wide else AgentConfig()
-        search, belief = IN_CATHETER.search, IN_CATHETER.belief
-        if search.speed_mm_s * navigation.seconds >= _WAYS * target:
+        if IN_CATHETER.search.speed_mm_s * navigation.seconds >= _WAYS * target:
             return IN_CATHETER
         fastest = min(device.max_velocity_mm_s for device in navigation.devices)
-        speed = max(search.speed_mm_s, _WAYS * target / navigation.seconds)
-        return replace(
-            IN_CATHETER,
-            search=replace(search, speed_mm_s=min(speed, fastest), together=True, longest_s=_HURRIED_S),
-            tries=_HURRIED_TRIES,
-            losses=_HURRIED_TRIES,
-            horizon_mm=_HURRIED_HORIZON_MM,
-            most_exposures=_HURRIED_EXPOSURES,
-            belief=replace(belief, copies=_COPIES, time_step_s=_COARSE_S if wide else belief.time_step_s),
-            off_course_mm=_OFF_WIDE_MM if wide else IN_CATHETER.off_course_mm,
-        )
+        hurried = HURRIED_IN_WIDE_LUMEN if wide else HURRIED
+        speed = max(hurried.search.speed_mm_s, _WAYS * target / navigation.seconds)
+        return replace(hurried, search=replace(hurried.search, speed_mm_s=min(speed, fastest)))
 
 
 IN_WIDE_LUMEN = AgentConfig(
@@ -110,17 +101,29 @@ IN_CATHETER = AgentConfig(
     tries=2,
 )
 """Settings of an agent of a wire in a catheter."""
+_WAYS = 4.0
+"""Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
+fast that there is time for it."""
+HURRIED = replace(
+    IN_CATHETER,
+    search=replace(IN_CATHETER.search, together=True, longest_s=10.0),
+    belief=replace(IN_CATHETER.belief, copies=32),
+    tries=20,
+    losses=20,
+    horizon_mm=60.0,
+    most_exposures=100,
+)
+"""Settings for a pair that moves together. Soft devices fold and snap on half a metre of route, and soon lie otherwise
+than simulated: more exposures may be taken, courses are short, and motions are drawn anew after each failure."""
+HURRIED_IN_WIDE_LUMEN = replace(HURRIED, belief=replace(HURRIED.belief, time_step_s=0.1), off_course_mm=10.0)
+"""The same on a route through a wide lumen, where soft devices do not lie as simulated: what counts is how they come to
+the next fork."""
 
 
 def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
-    """Return the calibration of the agent's ensemble.
+    """Return the calibration of the agent's ensemble, or raise `InputError` where there is none.
 
-    Args:
-        xray: how exposures find the tip.
-        devices: 1 for a wire alone, 2 with a catheter.
-
-    Raises:
-        InputError: there is none.
+    `xray` is how exposures find the tip, `devices` 1 for a wire alone, 2 with a catheter.
     """
     if (xray, devices) not in CALIBRATIONS:
         raise InputError(
@@ -128,23 +131,3 @@ def read_agent_calibration(xray: XrayKind, devices: int) -> Calibration:
             "xray: assumed and one catheter"
         )
     return Calibration.read(CALIBRATIONS[xray, devices])
-
-
-_WAYS = 4.0
-"""Wire and catheter move in turn if there is time for a way so many times as long as the route; else together, and so
-fast that there is time for it."""
-_HURRIED_S = 10.0
-"""Motions then take this much longer than twice the way at most, s."""
-_HURRIED_EXPOSURES = 100
-"""Exposures that may then be taken: soft devices fold and snap on half a metre of route."""
-_OFF_WIDE_MM = 10.0
-"""Another course for such a pair is searched in a wide lumen where it is off by so much, mm: soft devices do not lie
-there as simulated, and what counts is how they come to the next fork."""
-_HURRIED_TRIES = 20
-"""Times that such a pair may be lost, or a search for it may fail: its motions are drawn anew each time."""
-_HURRIED_HORIZON_MM = 60.0
-"""A course for it leads so far on, mm: soft devices soon lie otherwise than simulated."""
-_COPIES = 32
-"""Copies of such devices by which others are sought where none explains an exposure."""
-_COARSE_S = 0.1
-"""Time step of such a belief on a route through a wide lumen, s: the devices are half a metre long."""

@@ -47,14 +47,7 @@ of the latter else. What is hard is tried from near by then, and what is before 
 
 
 def places_of(route: Route, begun: float, *, alone: bool, together: bool) -> list[float]:
-    """Return the places that are passed, mm: the route's waypoints, and others between.
-
-    Args:
-        route: to the target.
-        begun: how far along it the devices have come, mm.
-        alone: whether there is no catheter.
-        together: whether wire and catheter move together.
-    """
+    """Return the places that are passed, mm, from where devices have come to: waypoints, and others between."""
     longest = _LONG_STRETCH_MM if together or alone else _STRETCH_MM
     places: list[float] = []
     ahead = route.waypoints[:-1] > begun - alone * ENTERED_MM
@@ -91,13 +84,7 @@ class Follower:
     """
 
     def __init__(self, drives: Drives, *, devices: int, turn_rad_s: float) -> None:
-        """Follow nothing yet.
-
-        Args:
-            drives: as they are believed to be.
-            devices: their number.
-            turn_rad_s: fastest rotation of a device whose play is taken up, rad/s.
-        """
+        """Follow nothing yet, by drives as they are believed to be, which take up play at `turn_rad_s` at most."""
         self._drives, self._devices, self._fastest = drives, devices, np.array([np.inf, turn_rad_s])
         self._looked, self.shows = 0, False
         self.begin(None)

@@ -8,21 +8,20 @@ some lead, or the wire waits in it; soft devices keep what they are driven with.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.course import Controls
-from endopilot.control.search_config import SearchConfig
-from endopilot.control.trials import CATHETER, WIRE, Control, Move, Trials
+from endopilot.control.trials import CATHETER, WIRE, Control, Each, Trials
+from endopilot.settings import Positive, Seconds, Within, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 
 Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
 """A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
 presses on the wall too hard, or the time is over."""
-Each = Float[np.ndarray, "trials"]
 PLACE, TURN, RETRACT, PUSH = range(4)
 """Steps of a motion."""
 _SLIP_SHARE = 0.5
@@ -44,6 +43,24 @@ _CATHETER_SHARE = 0.5
 _MISS_MM, _FORCE_MM, _SLACK, _MM_S = 10.0, 8.0, 0.05, 0.1
 """What it costs to leave all wires before the place and to press with the whole force limit, mm, what a millimetre of
 slack costs, and what a second, mm/s."""
+
+
+@settings
+class SearchConfig:
+    """How fast devices are moved in a search, and how a catheter follows its wire; `motions.yaml` has what is tried."""
+
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
+    """Translation of a device that is pushed straight on, mm/s."""
+    turn_rad_s: Annotated[float, Within(0.01, 1000)] = 7.0
+    """Fastest rotation that is tried, rad/s."""
+    lead_mm: Positive = 4.0
+    """Devices are turned this far before a junction, mm, or 1.4 lumen radii where that is more."""
+    behind_mm: Positive = 10.0
+    """The catheter follows to this far behind the wire's tip, mm, except to the target if its own tip is to arrive."""
+    together: bool = False
+    """The wire goes on while its catheter follows, instead of resting: in half the time."""
+    longest_s: Seconds = 30.0
+    """A motion that leads past a place takes this much longer than twice the way at full speed at most, s."""
 
 
 class Motions(NamedTuple):
@@ -203,15 +220,7 @@ class Driver:
     """Drives trials through their motions, see the module."""
 
     def __init__(self, trials: Trials, motions: Motions, goal: Goal, limits: Limits, config: SearchConfig) -> None:
-        """Take the motions.
-
-        Args:
-            trials: that are driven.
-            motions: one of each.
-            goal: the place that they are to pass.
-            limits: when they are given up.
-            config: speeds, and how a catheter follows.
-        """
+        """Take trials, a motion of each, the place that they are to pass, and when they are given up."""
         self._trials, self._motions, self._goal, self._limits, self._config = trials, motions, goal, limits, config
         self._step, self._alone = np.zeros(trials.count, dtype=int), trials.devices == 1
         self._turn, self._back = motions.turn_rad.copy(), motions.back_mm.copy()
@@ -294,12 +303,12 @@ class Driver:
         moves = np.abs(error) > _AT_MM  # not where it stays: NaN
         speed = np.where(moves, np.clip(error / (2 * DECISION_PERIOD_S), -fastest, fastest), 0.0)
         if self._alone:
-            return trials.control(Move(WIRE, speed)), ~moves
+            return trials.control(speed), ~moves
         gap = np.maximum(trials.inserted(CATHETER) + speed * DECISION_PERIOD_S + motions.lead_mm, 0.0)
         gap = np.where(np.isnan(motions.at_mm), 0.0, gap - trials.inserted(WIRE))
         gap = np.where(np.abs(gap) > REST_MM, gap, 0.0)
         wire = np.clip(gap / DECISION_PERIOD_S, -2 * fastest, 2 * fastest)
-        return trials.control(Move(WIRE, wire), Move(CATHETER, speed)), ~moves & (gap == 0)
+        return trials.control(wire, speed), ~moves & (gap == 0)
 
     def _push(self) -> Control:
         """Return what pushes devices on: a wire alone the slower, the nearer to the target."""
@@ -324,7 +333,7 @@ class Driver:
         if inside.any():
             wire_too, catheter_too = self._inside(left)
             wire, catheter = np.where(inside, wire_too, wire), np.where(inside, catheter_too, catheter)
-        return trials.control(Move(WIRE, wire), Move(CATHETER, catheter))
+        return trials.control(wire, catheter)
 
     def _in_turn(self, progress: Each, left: Each) -> tuple[Each, Each]:
         """Return the speeds, mm/s, of wires that lead, and of catheters that then follow until they are as far behind.
@@ -332,12 +341,7 @@ class Driver:
         Beyond a target to which the catheter's tip is to go, the wire goes as far as the catheter stays behind it
         elsewhere: the less, the fewer of its stiffer parts lie in the bends behind.
         """
-        trials, goal, speed, together = (
-            self._trials,
-            self._goal,
-            self._config.speed_mm_s,
-            self._config.together,
-        )
+        trials, goal, config = self._trials, self._goal, self._config
         inserted, around = trials.inserted(WIRE), trials.inserted(CATHETER)
         behind = inserted - self._behind - around
         if goal.last and goal.navigation.arriving:
@@ -345,13 +349,13 @@ class Driver:
             left = np.clip(goal.at_mm + self._behind, goal.at_mm, max(float(end) - REST_MM, goal.at_mm)) - progress
             behind = np.minimum(goal.at_mm - trials.mean(trials.tips.abscissa[:, CATHETER]), inserted - around)
         there = np.abs(left) <= REST_MM
-        if goal.last and together and not goal.navigation.arriving:
+        if goal.last and config.together and not goal.navigation.arriving:
             there |= goal.arrived(trials)
         follows = self._follows | there | (inserted - around >= self._motions.follow_mm)
         self._follows = (self._step == PUSH) & (behind > REST_MM) & follows
-        rests = there | (self._follows & (not together))
-        wire = np.where(rests, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, speed))
-        return wire, np.where(self._follows, np.clip(behind / DECISION_PERIOD_S, 0.0, speed), 0.0)
+        rests = there | (self._follows & (not config.together))
+        wire = np.where(rests, 0.0, np.clip(left / DECISION_PERIOD_S, -_SLOWEST_MM_S, config.speed_mm_s))
+        return wire, np.where(self._follows, np.clip(behind / DECISION_PERIOD_S, 0.0, config.speed_mm_s), 0.0)
 
     def _inside(self, left: Each) -> tuple[Each, Each]:
         """Return the speeds, mm/s, of wires that stay in catheters until these are past the place, and of these."""

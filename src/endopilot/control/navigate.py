@@ -7,9 +7,11 @@ believed it to be.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,9 +19,11 @@ from jaxtyping import Float
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import AgentPolicy, OraclePolicy
-from endopilot.control.propose import propose_devices
-from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
+from endopilot.control.agent_config import AgentConfig
+from endopilot.control.set_up import GivenConfig, TipChoice, choose_tip, tip_name
+from endopilot.devices.catheter import list_catheters
 from endopilot.devices.device import Wire
+from endopilot.devices.device_files import list_wires
 from endopilot.devices.robot import ASSUMED, RobotConfig, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
@@ -28,12 +32,12 @@ from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, public, settings
+from endopilot.settings import Seed, Text, public, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named, published_mean
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.simulation.world import NOMINAL, World, read_world
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route, check_passable
 from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
@@ -43,30 +47,15 @@ MotionKnown = Literal["nothing", "published", "measured", "exact"]
 
 
 @settings
-class NavigateConfig:
+class NavigateConfig(GivenConfig):
     """Limits, X-ray, and how reality differs from what the policy is given."""
 
-    arrives: Arrives = "wire"
-    """Whose tip is to go to the target: wire, or catheter, the one next to the wire."""
     robot: Text = ASSUMED
     """Name of the robot that drives them, such as assumed, ideal or kweon-2021-2d (docs/concepts/robot.md), or a YAML
     file. Policies are given it, not what the seed draws of it."""
     world: Text = NOMINAL
     """Name of the world that reality is, such as nominal, drawn or wide-lumen (docs/concepts/worlds.md), or a YAML
     file. The policy does not know it."""
-    tip: Text = "auto"
-    """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
-    as 75/5, 75 degrees over 5 mm."""
-    catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
-    """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
-    seconds: Seconds = 60.0
-    """Time in which the target is to be reached, s."""
-    force_limit_n: Positive = 0.5
-    """Largest force of the wall on one node that is safe, N."""
-    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
-    """Inserted length at the start, mm."""
-    start_rotation_rad: Finite = 0.0
-    """Rotation at the start, rad."""
     xray: XrayKind = "assumed"
     """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
     images of a patient whose pose is registered by one injection of contrast)."""
@@ -78,8 +67,6 @@ class NavigateConfig:
     """What is known of that motion, with the phase of heart and breath: nothing, the published mean, what a run of
     contrast has measured (where exposures are images), or exactly the patient's own. The C-arm takes it off what it
     measures, and agents simulate it."""
-    seed: Seed = 0
-    """Seed of encoder noise, detection errors, the policy, and of what the world draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,18 +190,7 @@ def set_up_navigation(
     origin = POLICIES.origin(policy) if isinstance(policy, str) else type(policy).__module__
     if isinstance(policy, str):
         policy = OraclePolicy(world) if policy == "oracle" else make_policy(policy)
-    given = Navigation(
-        anatomy=seen,
-        device=stack.wire,
-        target=goal,
-        catheters=stack.catheters,
-        arrives=config.arrives,
-        start_inserted_length_mm=config.start_inserted_length_mm,
-        start_rotation_rad=config.start_rotation_rad,
-        seconds=config.seconds,
-        force_limit_n=config.force_limit_n,
-        known_motion=_known_motion(config, world),
-    )
+    given = config.navigation(seen, stack, goal, _known_motion(config, world))
     check_passable(Route.to(seen, goal), given.devices[given.arriving])
     choice = choose_tip(given, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
     place, parts = goal.position(vessel), target.split(",")
@@ -297,3 +273,42 @@ def _see_catheter(vessel: Anatomy, device: Wire, world: World, config: NavigateC
     axis = c_arm.catheter_axis(real, np.random.default_rng([config.seed, 4]))
     unseen_deg, side_deg = lean_between(axis, real)
     return with_axis(vessel, axis), replace(world, axis_deg=unseen_deg, axis_side_deg=side_deg)
+
+
+def propose_devices(navigation: Navigation, *, seconds: float = 60.0) -> str:
+    """Return the first shipped devices, and their tip, that a search brings to the target; empty if it finds none.
+
+    The wire with a tip for the forks of the route comes first, then the other wires, then the wire in each catheter.
+    They are simulated as given: reality may differ. All searches take so much wall time, s, each a quarter at most.
+    """
+    until = time.perf_counter() + seconds
+    for stack in _stacks(navigation):
+        if time.perf_counter() > until:
+            return ""
+        try:
+            stack.check(navigation.anatomy)
+            given = replace(navigation, device=stack.wire, catheters=stack.catheters, arrives="wire")
+            chosen = choose_tip(given, catheter_tilt_deg=0.0)
+            if chosen.refused is not None and not stack.catheters:
+                continue
+            config = replace(AgentConfig.of(chosen.navigation), planning_s=seconds / 4)
+            policy = OraclePolicy(config=config)
+            policy.start(chosen.navigation, 0)
+        except InputError:  # they do not fit into one another, or into the lumen
+            continue
+        if policy.find_course(navigation.seconds).reached > 0.5:
+            return f"{stack.name} with a tip of {tip_name(chosen.navigation.device)}"
+    return ""
+
+
+def _stacks(navigation: Navigation) -> Iterator[Stack]:
+    """Yield the devices that are tried, which are read one by one."""
+    yield Stack(navigation.device)
+    for wire in list_wires():
+        if wire != navigation.device.name:
+            yield Stack.of(wire)
+    for catheter in list_catheters():
+        try:
+            yield Stack.of(navigation.device, catheter)
+        except InputError:
+            continue

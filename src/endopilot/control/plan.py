@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from endopilot.control.agent import OraclePolicy
 from endopilot.control.agent_config import AgentConfig
 from endopilot.control.course import Controls
 from endopilot.control.plan_config import Plan, PlanConfig, Steps
-from endopilot.control.set_up import TipChoice, choose_tip
+from endopilot.control.set_up import choose_tip
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import IDEAL, read_robot
@@ -30,6 +29,7 @@ from endopilot.settings import from_record, public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.csv_file import read_columns
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.route import Route, check_passable
 from endopilot.tasks.targets import find_target
@@ -37,6 +37,8 @@ from endopilot.types import Anatomy
 
 _TRIALS = 3
 """Searches at most: a path that does not hold in the rod core at its own settings is searched again there."""
+_MARGIN_S, _SAFE_RATIO = 5.0, 0.8
+"""Time that desired tips rest at the target, s, and their safety ratio γ/(r − r_w)."""
 
 
 @public
@@ -56,7 +58,7 @@ def plan(
         device: the wire, its name or its YAML file; or the wire and a catheter, which is then planned for too, by the
             method search. The model's wire if not given, the workhorse if there is no model.
         model: run made by `endopilot train`, for the method inverse; the simulated wires, named "wires", if not given.
-        config: method, time, limits and cost.
+        config: method, time and limits.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
@@ -66,62 +68,36 @@ def plan(
     """
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    model = None if model is None or str(model) == WIRES else Path(model)
-    catheters = device.catheters if isinstance(device, Stack) else ()
-    if catheters:
-        _check_for_stack(config, target, model)
-    wire = _wire(model, device)
-    tips = (
-        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_length_mm)
-        if target.endswith(".csv")
-        else None
-    )
+    run = None if model is None or str(model) == WIRES else Path(model)
+    stack, tips = _stack(run, device), None
+    if stack.catheters:
+        _check_for_stack(config, target, run)
+    if target.endswith(".csv"):
+        tips = read_tips(Path(target), stack.wire.max_velocity_mm_s, config.start_inserted_length_mm)
     goal = find_target(vessel.tree, target) if tips is None else last_place(vessel, tips, target)
-    navigation = Navigation(
-        anatomy=vessel,
-        device=wire,
-        target=goal,
-        catheters=catheters,
-        arrives=config.arrives,
-        start_inserted_length_mm=config.start_inserted_length_mm,
-        start_rotation_rad=config.start_rotation_rad,
-        seconds=config.seconds if tips is None else len(tips) * DECISION_PERIOD_S,
-        force_limit_n=config.force_limit_n,
-    )
-    route = Route.to(vessel, goal)
+    navigation, choice = config.navigation(vessel, stack, goal), None
     for each in navigation.devices:
-        check_passable(route, each)
-    choice, began = None, _clock()
-    if model is None:
+        check_passable(Route.to(vessel, goal), each)
+    if run is None:
         choice = choose_tip(navigation, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
         navigation = choice.navigation
-        route = Route.to(navigation.anatomy, goal)
     elif config.tip not in ("auto", "own"):
-        raise InputError(
-            f"tip: {config.tip}; {model} was trained with the wire's own tip: give own, or leave --tip out"
-        )
-    spent = _clock() - began
-    if tips is None:
-        _check_time(navigation, config)
-        desired = tips_along(
-            route,
-            wire.tip_radius_mm,
-            start_mm=config.start_inserted_length_mm,
-            speed_mm_s=config.speed_mm_s,
-            seconds=config.seconds,
-            safe_ratio=config.cost.safe_ratio,
-        )
-    else:
+        raise InputError(f"tip: {config.tip}; {run} was trained with the wire's own tip: give own, or leave --tip out")
+    desired = None
+    if tips is not None:
+        navigation = replace(navigation, seconds=len(tips) * DECISION_PERIOD_S)
         desired = tips[["abscissa", "offset"]].to_numpy(float)
-    made, trials = None, _TRIALS if config.method == "search" and tips is None else 1
-    trials = min(trials, 2) if catheters else trials  # nothing of theirs is drawn at random
-    for trial in range(trials):
-        find = _method(navigation, config, model, desired, follow=tips is not None, trial=trial)
-        began = _clock()
-        control, predicted = find()
-        control = control.reshape(len(control), -1, 2)
-        spent += _clock() - began
-        made = _checked(navigation, config, model, choice, desired, control, predicted, spent)
+    else:
+        _check_time(navigation, config)
+        if config.method == "inverse":
+            desired = tips_along(navigation, config.speed_mm_s)
+    trials = _TRIALS if config.method == "search" and tips is None else 1
+    made, began = None, time.process_time()
+    for trial in range(min(trials, 2) if stack.catheters else trials):  # nothing of a pair's is drawn at random
+        control, predicted = _find(navigation, config, run, desired, trial)
+        seconds = time.process_time() - began
+        trajectory = _driven(navigation, control.reshape(len(control), -1, 2), predicted, desired)
+        made = Plan(navigation, config, None if run is None else str(run), trajectory, choice, seconds)
         if made.reached and made.within_force_limit:
             break
     assert made is not None
@@ -130,33 +106,24 @@ def plan(
     return made
 
 
-def _clock() -> Float[np.ndarray, "2"]:
-    """Return wall time and processor time, s."""
-    return np.array([time.perf_counter(), time.process_time()])
-
-
-def _method(
-    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, *, follow: bool, trial: int
-) -> Callable[[], tuple[Controls | Steps, Steps]]:
-    """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
-    if config.method == "inverse" and model is not None:
+def _find(
+    navigation: Navigation, config: PlanConfig, run: Path | None, desired: Steps | None, trial: int
+) -> tuple[Controls | Steps, Steps]:
+    """Return controls, and the tips that whatever found them predicts, mm."""
+    if config.method == "inverse" and run is not None and desired is not None:
         with extra_named(f"plan by {config.method}"):
-            from endopilot.control.network_plan import network_planner  # torch is slow to import
+            from endopilot.control.network_plan import plan_by_networks  # torch is slow to import
 
-        return network_planner(navigation, model, desired)
-    if config.method == "inverse" or (config.method == "search" and follow):
-        return lambda: _track(navigation, desired)
-    return lambda: _search(navigation, config, trial) if config.method == "search" else _by_policy(navigation, config)
+        return plan_by_networks(navigation, run, desired)
+    if config.method in ("inverse", "search") and desired is not None:
+        return _track(navigation, desired)
+    return _search(navigation, config, trial) if config.method == "search" else _by_policy(navigation, config)
 
 
-def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> None:
-    """Check that a plan with a catheter asks for nothing that a wire alone can do.
-
-    Raises:
-        InputError: a trained model, another method than search, or desired tips.
-    """
-    if model is not None:
-        raise InputError(f"--model {model}: models are of a wire alone; leave --model or --catheter out")
+def _check_for_stack(config: PlanConfig, target: str, run: Path | None) -> None:
+    """Raise `InputError` where a plan with a catheter asks for what a wire alone can do."""
+    if run is not None:
+        raise InputError(f"--model {run}: models are of a wire alone; leave --model or --catheter out")
     if config.method != "search":
         raise InputError(f"method: {config.method}; a wire in a catheter is planned by search: give search")
     if target.endswith(".csv"):
@@ -165,17 +132,17 @@ def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> Non
         )
 
 
-def _wire(model: Path | None, device: Wire | Stack | str | Path | None) -> Wire:
-    """Return the wire: the one that is asked for, else the model's; both must be the same."""
-    asked = None if device is None else Stack.of(device).wire
-    if model is None:
-        return asked or read_wire("workhorse-014")
-    trained = from_record(Wire, read_run(model)["device"])
-    if asked is not None and asked.constants != trained.constants:
+def _stack(run: Path | None, device: Wire | Stack | str | Path | None) -> Stack:
+    """Return the devices: those that are asked for, else the model's wire; both must have the same."""
+    asked = None if device is None else Stack.of(device)
+    if run is None or (asked is not None and asked.catheters):
+        return asked or Stack(read_wire("workhorse-014"))
+    trained = from_record(Wire, read_run(run)["device"])
+    if asked is not None and asked.wire.constants != trained.constants:
         raise InputError(
-            f"--device {asked.name}: {model} was trained with {trained.name}; leave --device out or train anew"
+            f"--device {asked.name}: {run} was trained with {trained.name}; leave --device out or train anew"
         )
-    return trained
+    return Stack(trained)
 
 
 def _check_time(navigation: Navigation, config: PlanConfig) -> None:
@@ -216,11 +183,7 @@ def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Con
 
 
 def _check_kept(made: Plan) -> None:
-    """Check that a plan which was found in the rod core keeps the force limit there, and reaches the target.
-
-    Raises:
-        InputError: it does not; the line says which.
-    """
+    """Raise `InputError` where a plan that was searched breaks the force limit in the rod core, or does not arrive."""
     navigation, wire = made.navigation, made.navigation.device.name
     goal = f"branch {navigation.target.branch} of {navigation.anatomy.name} with {wire}"
     if not made.within_force_limit:
@@ -229,9 +192,8 @@ def _check_kept(made: Plan) -> None:
             f"with {made.force.max():.3g} N; give a larger force_limit_n, another seed or a softer wire"
         )
     if not made.reached:
-        tip = made.arriving_tip
-        far, branch = float(tip.abscissa[-1]), int(tip.branch[-1])
-        where = f"at {far:.1f} of {navigation.target.abscissa:.1f} mm"
+        branch = int(made.tip.branch[-1, navigation.arriving])
+        where = f"at {made.end_mm:.1f} of {navigation.target.abscissa:.1f} mm"
         if branch != navigation.target.branch:
             where += f", in branch {branch}"
         raise InputError(
@@ -268,64 +230,32 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     return control, np.column_stack([tip.abscissa, tip.offset])[1:]
 
 
-def _checked(
-    navigation: Navigation, config: PlanConfig, model: Path | None, choice: TipChoice | None,
-    desired: Float[np.ndarray, "wanted 2"], control: Controls, predicted: Steps, spent: Float[np.ndarray, "2"],
-) -> Plan:  # fmt: skip
-    """Put the controls within the limits, drive the rod core with them, and return the plan."""
+def _driven(navigation: Navigation, control: Controls, predicted: Steps, desired: Steps | None) -> Trajectory:
+    """Return what the rod core makes of controls within the limits, with what was predicted and desired beside it."""
     start = navigation.start
     limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
     parts = [within_limits(control[:, k], each, start[k, 0]) for k, each in enumerate(limits)]
-    control = np.stack(parts, axis=1)
+    command = np.stack(parts, axis=1)[None]
     trajectory = simulate(
-        navigation.anatomy, navigation.stack, control[None], initial=start[None], config=SimulatorConfig(threads=1)
+        navigation.anatomy, navigation.stack, command, initial=start[None], config=SimulatorConfig(threads=1)
     )
-    wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
-    return Plan(
-        navigation=navigation,
-        config=config,
-        model=None if model is None else str(model),
-        trajectory=trajectory,
-        desired=wanted[: len(control)],
-        predicted=predicted,
-        reached=bool(navigation.reached(trajectory.tip[0]).any()),
-        why=choice.why if choice else "",
-        tilt_deg=choice.tilt_deg if choice else 0.0,
-        seconds_to_plan=float(spent[0]),
-        processor_seconds=float(spent[1]),
-    )
+    columns = {"predicted": predicted[None]} | ({} if desired is None else {"desired": desired[None, : len(control)]})
+    return replace(trajectory, columns=columns, about={"target": asdict(navigation.target)})
 
 
 def within_limits(control: Steps, limits: DriveLimits, inserted_length_mm: float) -> Steps:
-    """Return controls that are finite and within the drive's limits and its travel, whatever a model proposes.
-
-    Args:
-        control: mm/s and rad/s of each period.
-        limits: of the drive.
-        inserted_length_mm: inserted length at the start, mm.
+    """Return controls (mm/s, rad/s) that are finite and within the drive's limits and its travel, whatever a model
+    proposes for a device that is inserted so far at the start, mm.
     """
     finite = np.isfinite(control).all(axis=1, keepdims=True)
     return limits.clip_sequence(np.where(finite, control, 0.0), inserted_length_mm, DECISION_PERIOD_S)
 
 
-_MARGIN_S = 5.0
-"""Time that desired tips rest at the target, s."""
-
-
 def read_tips(path: Path, fastest_mm_s: float, start_mm: float) -> pd.DataFrame:
     """Read desired tip states: columns time_s (0.5, 1.0, ...), tip_abscissa_mm, tip_offset_mm and, optional, branch.
 
-    Args:
-        path: of the table.
-        fastest_mm_s: translation of the drive, mm/s.
-        start_mm: Δ at the start, mm.
-
-    Returns:
-        A table with columns abscissa, offset and branch (−1 where it is not given), a row a sample period.
-
-    Raises:
-        InputError: not such a table, or it asks for the end sooner than the drive can be there; the line names file,
-            column, row and mend.
+    A table is returned with columns abscissa, offset and branch (−1 where it is not given), a row a sample period.
+    InputError where it is none, or asks for the end sooner than a drive of this speed can be there from Δ `start_mm`.
     """
     columns = ("time_s", "tip_abscissa_mm", "tip_offset_mm")
     read = read_columns(path, columns, ["branch"])
@@ -347,10 +277,8 @@ def read_tips(path: Path, fastest_mm_s: float, start_mm: float) -> pd.DataFrame:
 
 
 def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
-    """Return the place of the last desired tip, on its branch or else on the longest path.
-
-    Raises:
-        InputError: it lies outside the tree.
+    """Return the place of the last desired tip, on its branch or else on the longest path; InputError where there is
+    none.
     """
     tree, branch, abscissa = anatomy.tree, int(tips["branch"].iloc[-1]), float(tips["abscissa"].iloc[-1])
     if branch < 0:
@@ -361,22 +289,14 @@ def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
         raise InputError(f"{target}: the last tip: {error}; correct tip_abscissa_mm or branch") from None
 
 
-def tips_along(
-    route: Route, wire_radius_mm: float, *, start_mm: float, speed_mm_s: float, seconds: float, safe_ratio: float
-) -> Float[np.ndarray, "samples 2"]:
-    """Return desired tips that go along a route at some speed, as near to the wall as is safe, and rest at its end.
-
-    Args:
-        route: the path to the target.
-        wire_radius_mm: of the wire, mm.
-        start_mm: Δtip at the start, mm.
-        speed_mm_s: mm/s.
-        seconds: most time that they take, s.
-        safe_ratio: γ/(r − r_w) of the desired tips.
+def tips_along(navigation: Navigation, speed_mm_s: float) -> Float[np.ndarray, "samples 2"]:
+    """Return desired tips (Δtip, γtip), mm: along the route at some speed, as near to the wall as is safe, and at rest
+    at its end.
     """
+    route, start_mm = Route.to(navigation.anatomy, navigation.target), navigation.start_inserted_length_mm
     length_mm = max(route.target.abscissa - start_mm, 0.0)
-    periods = int(np.ceil(min(length_mm / speed_mm_s + _MARGIN_S, seconds) / DECISION_PERIOD_S))
+    periods = int(np.ceil(min(length_mm / speed_mm_s + _MARGIN_S, navigation.seconds) / DECISION_PERIOD_S))
     ahead = start_mm + speed_mm_s * DECISION_PERIOD_S * np.arange(1, periods + 1)
     abscissa = np.minimum(ahead, route.target.abscissa)
-    room = np.maximum(route.radius(abscissa) - wire_radius_mm, 0.0)
-    return np.column_stack([abscissa, safe_ratio * room])
+    room = np.maximum(route.radius(abscissa) - navigation.device.tip_radius_mm, 0.0)
+    return np.column_stack([abscissa, _SAFE_RATIO * room])

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.files import writing
@@ -31,31 +32,33 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     title = f"{plan.navigation.anatomy.name}, {plan.navigation.stack.name}: {plan.config.method}"
     wire, *around = np.moveaxis(plan.trajectory.tip_position[0], 1, 0)
     draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, wire, title, around)
-    time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
+    time_s, limit_n = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1), plan.navigation.force_limit_n
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
     _draw_tip(plan, time_s, panels[0])
-    _draw_safety(plan, time_s, panels[1])
-    panels[2].plot(time_s, plan.force, color="tab:red")
-    panels[2].axhline(plan.navigation.force_limit_n, color="0.4", linestyle="--", linewidth=1)
-    panels[2].set_ylabel("wall force, N")
-    panels[2].set_ylim(0, 1.1 * max(plan.navigation.force_limit_n, float(plan.force.max())))
-    edges = np.append(0.0, time_s)
-    for k, (colors, style, whose) in enumerate(zip(_CONTROL_COLORS, ("-", "--"), ("", "catheter's "), strict=True)):
+    for axes, values, limit, color, label in (
+        (panels[1], plan.ratio, AdviserConfig().wall_ratio, "tab:purple", "safety ratio\nγ/(r − r_w)"),
+        (panels[2], plan.force, limit_n, "tab:red", "wall force, N"),
+    ):
+        axes.plot(time_s, values, color=color)
+        axes.axhline(limit, color="0.4", linestyle="--", linewidth=1)
+        axes.set(ylabel=label, ylim=(0, 1.1 * max(limit, float(values.max()))))
+    for k, colors in enumerate(_CONTROL_COLORS[: plan.control.shape[1]]):
         for axis, unit in enumerate(("translation, mm/s", "rotation, rad/s")):
-            if k < plan.control.shape[1]:
-                panels[3].stairs(
-                    plan.control[:, k, axis], edges, baseline=None, color=colors[axis], linestyle=style,
-                    linewidth=1.5 - 0.5 * k, label=f"{whose}{unit}",
-                )  # fmt: skip
+            style = {"color": colors[axis], "linestyle": ("-", "--")[k], "linewidth": 1.5 - 0.5 * k}
+            label = ("", "catheter's ")[k] + unit
+            panels[3].stairs(plan.control[:, k, axis], np.append(0.0, time_s), baseline=None, label=label, **style)
+    panels[3].set(ylabel="control", xlabel="time, s")
     legend_above(panels[3])
-    panels[3].set_ylabel("control")
-    panels[3].set_xlabel("time, s")
     if xray is not None:
-        _draw_xray(plan, xray, time_s, panels)
+        middle, half = plan.predicted[:, 0], xray.half_width[:, 0]
+        panels[0].fill_between(time_s, middle - half, middle + half, color="tab:orange", alpha=0.25, linewidth=0)
+        panels[0].plot([], [], color="black", linestyle=":", linewidth=1, label="X-ray")
     for panel in panels:
+        for moment in () if xray is None else time_s[xray.exposure]:
+            panel.axvline(moment, color="black", linestyle=":", linewidth=1)
         panel.set_xlim(0.0, time_s[-1])
-    for panel in panels[:3]:
-        panel.tick_params(labelbottom=False)
+        panel.tick_params(labelbottom=panel is panels[3])
+    legend_above(panels[0])
     with writing(Path(path)) as partial:
         figure.savefig(partial, dpi=90)
     plt.close(figure)
@@ -68,15 +71,7 @@ def draw_route(
     title: str,
     catheters: Sequence[Float[np.ndarray, "n 3"]] = (),
 ) -> None:
-    """Draw the tree from the front with the route, the target and the paths of the tips, LPS mm.
-
-    Args:
-        axes: where.
-        navigation: vessel and target.
-        position: of the wire's tip.
-        title: of the panel.
-        catheters: positions of the tip of each catheter, if their paths are to be drawn.
-    """
+    """Draw the tree from the front with the route, the target and the paths of the tips, the wire's first, LPS mm."""
     tree, route = navigation.anatomy.tree, Route.to(navigation.anatomy, navigation.target)
     for branch in tree.branches:
         x, _, z = branch.centerline.points.T
@@ -102,7 +97,8 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     tip = plan.tip[:, 0]
     route = Route.to(plan.navigation.anatomy, plan.navigation.target)
     off_route = route.off_route(tip) > 0
-    axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")
+    if "desired" in plan.trajectory.columns:
+        axes.plot(time_s, plan.trajectory.columns["desired"][0, :, 0], color="tab:green", label="desired")
     axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="predicted by the model")
     axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
     for k, color in enumerate(CATHETER_COLORS[: plan.control.shape[1] - 1], start=1):
@@ -112,27 +108,8 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.8", linewidth=0.8, zorder=0)
     axes.set_ylabel("Δtip, mm")
-    legend_above(axes)
-
-
-def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[Axes]) -> None:
-    """Draw the adviser's bands around the prediction, and a line where an exposure will be due."""
-    middle, half = plan.predicted[:, 0], xray.half_width[:, 0]
-    panels[0].fill_between(time_s, middle - half, middle + half, color="tab:orange", alpha=0.25, linewidth=0)
-    for panel in panels:
-        for moment in time_s[xray.exposure]:
-            panel.axvline(moment, color="black", linestyle=":", linewidth=1)
-    panels[0].plot([], [], color="black", linestyle=":", linewidth=1, label="X-ray")
-    legend_above(panels[0])
 
 
 def legend_above(axes: Axes) -> None:
     """Put the legend in a row above a panel, where it covers no curve."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=7, fontsize=8, frameon=False, borderaxespad=0.1)
-
-
-def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
-    axes.plot(time_s, plan.ratio, color="tab:purple")
-    axes.axhline(plan.config.cost.safe_ratio, color="0.4", linestyle="--", linewidth=1)
-    axes.set_ylim(0, 1.1 * max(1.0, float(plan.ratio.max())))
-    axes.set_ylabel("safety ratio\nγ/(r − r_w)")

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.belief.adviser import AdviserConfig
-from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import predicted_tip
 from endopilot.belief.watch import Watch
@@ -35,15 +34,10 @@ class PlannedXray:
     half_width: Float[np.ndarray, "samples 2"]
 
 
-def plan_xray(plan: Plan, *, calibration: Calibration | None = None) -> PlannedXray:
-    """Return the X-ray that a plan will need if all goes as planned; the tip is observed at the start.
-
-    Args:
-        plan: the plan.
-        calibration: of the agent's simulated wires; the shipped one if not given.
-    """
+def plan_xray(plan: Plan) -> PlannedXray:
+    """Return the X-ray that a plan will need if all goes as planned; the tip is observed at the start."""
     navigation, tip = plan.navigation, plan.tip[:, 0]
-    calibration = calibration or read_agent_calibration("assumed", len(navigation.devices))
+    calibration = read_agent_calibration("assumed", len(navigation.devices))
     config = AgentConfig.of(navigation).belief
     wires = Belief(navigation, Belief.around(config), config)
     start, alone = predicted_tip(wires), not navigation.catheters

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from endopilot.control.drive import Driver, Goal
+from endopilot.control.drive import Driver, Goal, SearchConfig
 from endopilot.control.repertoire import Repertoire, Row, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.trials import Trials
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
@@ -65,14 +64,10 @@ def forks(route: Route, device: Wire) -> tuple[Fork, ...]:
 def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray, "forks"]:
     """Return with how many of `ROTATIONS` rotations a wire enters the right branch at each fork of the route.
 
-    A wire is brought up to each fork of the route, turned to all sides and pushed on straight (`Push`). It goes on
-    with the rotation in the middle of those that enter. Behind a fork that no rotation enters, or that the wire does
-    not come up to, the numbers are 0. A rotation that presses on the wall with more than the navigation's force limit
-    does not count.
-
-    Args:
-        navigation: vessel, target, start and force limit; its own device does not matter.
-        device: the wire.
+    A wire is brought up to each fork of the route, turned to all sides and pushed on straight. It goes on with the
+    rotation in the middle of those that enter. Behind a fork that no rotation enters, or that the wire does not come up
+    to, the numbers are 0. A rotation that presses on the wall with more than the navigation's force limit does not
+    count. The navigation's own device does not matter.
     """
     end = float(navigation.anatomy.tree.branches[navigation.target.branch].centerline.abscissa[-1])
     route = Route.to(navigation.anatomy, replace(navigation.target, abscissa=end))  # a fork may lie next to the target

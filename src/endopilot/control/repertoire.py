@@ -10,8 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from endopilot.control.drive import Each, Limits, Motions
-from endopilot.control.search_config import SearchConfig
+from endopilot.control.drive import Each, Limits, Motions, SearchConfig
 from endopilot.control.trials import CATHETER, WIRE, Control
 from endopilot.files import read_yaml
 from endopilot.settings import Finite, NonNegative, Positive, Share, Within, settings
@@ -119,16 +118,7 @@ class Row:
         random: np.random.Generator,
         best: Motions | None = None,
     ) -> Motions:
-        """Return the motions, rotations next to each other.
-
-        Args:
-            obstacle_mm: see the class, mm.
-            step_mm: likewise.
-            config: speed.
-            devices: of a stack.
-            random: what is drawn from.
-            best: of the rounds before; None in the first.
-        """
+        """Return the motions about an obstacle, rotations next to each other; `best` are those of the rounds before."""
         if self.rounds > 1:
             at, turn, back = self._drawn(obstacle_mm, step_mm, random, best)
             lead, follow = np.zeros(self.turns), np.full(self.turns, _ALL_ALONG_MM)
@@ -224,11 +214,5 @@ def sides(count: int) -> Each:
 
 
 def stand_off(route: Route, at_mm: float, least_mm: float) -> float:
-    """Return how far before or beyond a place of the route devices are turned, mm: a branch's mouth is about as wide.
-
-    Args:
-        route: to the target.
-        at_mm: the place, mm.
-        least_mm: in a narrow vessel, mm.
-    """
+    """Return how far off a place of the route devices are turned, mm: a branch's mouth is about as wide."""
     return max(least_mm, _MOUTH_RADII * float(route.radius(np.array([at_mm]))[0]))

@@ -11,7 +11,6 @@ round by round: each goes on from the best of the one before, or is drawn around
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
@@ -19,12 +18,10 @@ import numpy as np
 from endopilot.belief.belief import Belief
 from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.control.course import Course, places_of
-from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Motions, Outcome
+from endopilot.control.drive import ROUNDING, Driver, Goal, Halt, Motions, Outcome, SearchConfig
 from endopilot.control.repertoire import Repertoire, Row, Table, stand_off
-from endopilot.control.search_config import SearchConfig
 from endopilot.control.set_up import describe_halt
 from endopilot.control.trials import Trials
-from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
@@ -56,21 +53,13 @@ class Search:
         budget: Budget | None = None,
         table: Table | None = None,
     ) -> None:
-        """Lay out the trials.
+        """Lay out trials of the wires of a belief, whose settings of the rod core are taken.
 
         Args:
-            navigation: what is to be done.
-            route: to its target.
-            belief: whose wires they are, and whose settings of the rod core are taken.
-            config: settings of the search.
             seed: of what is drawn at random.
             budget: of each call of `find`; none if not given.
             table: what is tried; the package's own if not given.
-
-        Raises:
-            InputError: there is more than one catheter.
         """
-        check_devices(navigation)
         self._navigation, self.route, self.config = navigation, route, config
         self.budget = budget or Budget()
         self._belief, self._table, self._trials = belief, table, dict[tuple[int, ...], Trials]()
@@ -131,11 +120,8 @@ class Search:
         self.halt, self._kept, self._settled = "", self._course.kept(), list[int]()
 
     def go_on(self, found: Callable[[Course], None] | None = None, *, advance: Advance | None = None) -> Course:
-        """Return a course from where it has set out to the target.
-
-        Args:
-            found: called with the course as far as it is known, whenever it has passed another place.
-            advance: as in `find`.
+        """Return a course from where it has set out to the target; `found` is called with the course as far as it is
+        known, whenever it has passed another place.
         """
         try:
             self._lead(advance, found)
@@ -236,7 +222,7 @@ class Search:
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
             for pauses in (False, True):
                 self._repeat(outcome, trial, pauses=pauses)
-                there, done = goal.passed(course) * course.weight, course.rows[self._kept.periods :]
+                there, done = goal.passed(course) * course.weight, course.rows[len(self._kept.rows) :]
                 pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
                 enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
                 if enough and pressed <= force_n:
@@ -252,7 +238,7 @@ class Search:
         self._repeat(outcome, int(np.argmin(left)), pauses=True, most=row.draws.kept)
         return True
 
-    def _repeat(self, outcome: Outcome, trial: int, *, pauses: bool, most: int = sys.maxsize) -> None:
+    def _repeat(self, outcome: Outcome, trial: int, *, pauses: bool, most: int | None = None) -> None:
         """Let the course do what a trial did, with or without the periods in which nothing moves."""
         self._course.restore(self._kept)
         for control in outcome.controls_of(trial)[:most]:
@@ -280,13 +266,3 @@ class Search:
     def _here(self) -> float:
         """How far along the route the devices have come, mm."""
         return float(self._course.progress(self.route)[0])
-
-
-def check_devices(navigation: Navigation) -> None:
-    """Refuse a navigation that a search cannot drive.
-
-    Raises:
-        InputError: there is more than one catheter.
-    """
-    if len(navigation.catheters) > 1:
-        raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")

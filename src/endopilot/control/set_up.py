@@ -10,6 +10,7 @@ where none enters a fork near the ostium, and where the route leaves its axis st
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,9 +19,13 @@ from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.drive import Halt
 from endopilot.control.reach import ROTATIONS, Fork, forks, rotations_that_enter
 from endopilot.devices.device import Wire
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.route import BEYOND_MM, Route
+from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
+from endopilot.simulation.motion import Motion
+from endopilot.tasks.navigation import Arrives, Navigation, Target
+from endopilot.tasks.route import BEYOND_MM, ENTERED_MM, Route
+from endopilot.types import Anatomy
 
 SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))
 """Tips that are tried, angle in degrees and length in mm: from the usual one to the largest that a hand bends."""
@@ -36,6 +41,44 @@ _CATHETER_MM = 20.0
 """The catheter's axis decides how the wire lies as far as this from the ostium, mm."""
 _AZIMUTHS = 8
 Count = Int[np.ndarray, "forks"]
+
+
+@settings
+class GivenConfig:
+    """What plans and navigations are given beside vessel, devices and target."""
+
+    arrives: Arrives = "wire"
+    """Whose tip is to go to the target: wire, or catheter, the one around the wire."""
+    tip: Text = "auto"
+    """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
+    as 75/5, 75 degrees over 5 mm."""
+    catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
+    """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
+    seconds: Seconds = 60.0
+    """Time in which the target is to be reached, s."""
+    force_limit_n: Positive = 0.5
+    """Largest force of the wall on one node that is safe, N."""
+    start_inserted_length_mm: Annotated[float, Within(0, 5000)] = 2.0
+    """Inserted length at the start, mm."""
+    start_rotation_rad: Finite = 0.0
+    """Rotation at the start, rad."""
+    seed: Seed = 0
+    """Seed of encoder noise, detection errors, the policy or search, and of what the world draws."""
+
+    def navigation(self, anatomy: Anatomy, stack: Stack, target: Target, known: Motion | None = None) -> Navigation:
+        """Return what is to be done, in a vessel of which a motion is known, with the wire's tip as it is delivered."""
+        return Navigation(
+            anatomy=anatomy,
+            device=stack.wire,
+            target=target,
+            catheters=stack.catheters,
+            arrives=self.arrives,
+            start_inserted_length_mm=self.start_inserted_length_mm,
+            start_rotation_rad=self.start_rotation_rad,
+            seconds=self.seconds,
+            force_limit_n=self.force_limit_n,
+            known_motion=known,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +102,7 @@ class TipChoice:
     @property
     def refused(self) -> Fork | None:
         """The first fork that the tip enters with no rotation, or None."""
-        return _refused(self.forks, self.entering)
+        return next((fork for fork, count in zip(self.forks, self.entering, strict=True) if not count), None)
 
     @property
     def tip(self) -> str:
@@ -70,13 +113,7 @@ class TipChoice:
 def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: float = TILT_DEG) -> TipChoice:
     """Choose the shape of the wire's tip for a navigation, and turn the guiding catheter where that alone helps.
 
-    Args:
-        navigation: vessel, wire and target, the wire with its own tip.
-        tip: "auto", "own" for the wire's own tip, or a shape such as "75/5": degrees and mm.
-        catheter_tilt_deg: how far the catheter's axis may be turned, degrees; 0 leaves it as it is.
-
-    Raises:
-        InputError: no such tip, or one that a hand cannot give the wire.
+    The options are those of `GivenConfig`; no such tip, or one that a hand cannot give the wire, raises `InputError`.
     """
     devices, given = _tips(navigation.device, tip), navigation
     route = Route.to(navigation.anatomy, navigation.target)
@@ -86,22 +123,18 @@ def choose_tip(navigation: Navigation, *, tip: str = "auto", catheter_tilt_deg: 
         tilt_deg = min(catheter_tilt_deg, steep_deg)
         navigation = replace(given, anatomy=with_axis(given.anatomy, _towards(route, tilt_deg)))
         turned_for = f"the route leaves its axis by {steep_deg:.0f}°"
-    best, counts = _choose(navigation, devices)
-    made, refused = replace(navigation, device=devices[best]), _refused(places, counts[best])
-    if refused is not None and catheter_tilt_deg > 0 and _near_catheter(route, counts[best]):
-        for axis in _axes(route, catheter_tilt_deg):
-            turned = replace(given, anatomy=with_axis(given.anatomy, axis))
-            other, after = _choose(turned, devices)
-            if _merit(after[other]) > _merit(counts[best]):
-                best, counts, tilt_deg = other, after, catheter_tilt_deg
-                made = replace(turned, device=devices[best])
-                turned_for = f"along its given axis no tip enters {_into(refused)}"
-            if _suffices(counts[best]):
-                break
-    why = _why(made.device, places, counts, best)
-    if tilt_deg:
-        why += f"; the catheter is turned by {tilt_deg:.3g}°: {turned_for}"
-    return TipChoice(made, tilt_deg, places, counts[best], why)
+    made = _choose(navigation, devices, places, tilt_deg, turned_for)
+    refused = made.refused
+    if refused is None or not catheter_tilt_deg or refused.abscissa > _CATHETER_MM:  # too far for its axis to help
+        return made
+    turned_for = f"along its given axis no tip enters {_into(refused)}"
+    for axis in _axes(route, catheter_tilt_deg):
+        turned = replace(given, anatomy=with_axis(given.anatomy, axis))
+        other = _choose(turned, devices, places, catheter_tilt_deg, turned_for)
+        made = max(made, other, key=lambda each: _merit(each.entering))  # the first of equals
+        if (made.entering >= ENOUGH).all():
+            break
+    return made
 
 
 def tip_name(device: Wire) -> str:
@@ -135,29 +168,28 @@ def _limits(device: Wire) -> str:
     return f"a hand bends its tip by {least:g} to {largest:g} degrees over {shortest:g} to {longest:g} mm"
 
 
-def _choose(navigation: Navigation, devices: list[Wire]) -> tuple[int, dict[int, Count]]:
-    """Return the first wire that suffices, else the best one, and the counts of those that were tried."""
-    counts: dict[int, Count] = {}
-    for index, device in enumerate(devices):
-        counts[index] = rotations_that_enter(navigation, device)
-        if _suffices(counts[index]):
-            return index, counts
-    return max(counts, key=lambda index: (_merit(counts[index]), -index)), counts
-
-
-def _suffices(count: Count) -> bool:
-    return bool((count >= ENOUGH).all())
+def _choose(
+    navigation: Navigation, devices: list[Wire], places: tuple[Fork, ...], tilt_deg: float, turned_for: str
+) -> TipChoice:
+    """Choose the first wire that suffices, else the best one."""
+    counts: list[Count] = []
+    for device in devices:
+        counts.append(rotations_that_enter(navigation, device))
+        if (counts[-1] >= ENOUGH).all():
+            best = len(counts) - 1
+            break
+    else:
+        best = max(range(len(counts)), key=lambda index: _merit(counts[index]))  # the first of equals
+    why = _why(devices[best], places, counts, best)
+    if tilt_deg:
+        why += f"; the catheter is turned by {tilt_deg:.3g}°: {turned_for}"
+    return TipChoice(replace(navigation, device=devices[best]), tilt_deg, places, counts[best], why)
 
 
 def _merit(count: Count) -> tuple[int, int]:
     """Return how good a tip is: places that it passes, and rotations at the hardest of them."""
     passed = count[count > 0]
     return len(passed), int(passed.min()) if len(passed) else 0
-
-
-def _near_catheter(route: Route, count: Count) -> bool:
-    """Return whether turning the catheter may help: whether the fork that refuses lies near it."""
-    return bool(route.junctions[int(np.argmin(count > 0))] <= _CATHETER_MM)
 
 
 def _off_axis_deg(route: Route) -> float:
@@ -182,12 +214,7 @@ def _axes(route: Route, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:
     return sorted(turned, key=lambda axis: -float(axis @ onwards))
 
 
-def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:
-    """Return the first fork that a tip enters with no rotation, or None."""
-    return next((fork for fork, entering in zip(places, count.tolist(), strict=True) if not entering), None)
-
-
-def _why(device: Wire, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
+def _why(device: Wire, places: tuple[Fork, ...], counts: list[Count], best: int) -> str:
     """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
     shape = f"the tip ({np.degrees(device.tip_bend_rad):.3g}° over {device.tip_bend_length_mm:.3g} mm)"
     if not places:
@@ -209,31 +236,19 @@ SPARE_SHARE = 0.9
 """Share of the force limit that a path is followed under: what is uncertain takes the rest."""
 
 
-def near_fork(at_mm: float, route: Route, navigation: Navigation) -> Fork | None:
-    """Return the fork of the route that a tip which came to an abscissa (mm) is at, or None."""
-    device = navigation.device
-    for fork in forks(route, device):
-        radius = 0.5 * (fork.width_mm + device.diameter_mm)
-        if abs(at_mm - fork.abscissa) <= radius + BEYOND_MM + 1.0:
-            return fork
-    return None
-
-
 def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation) -> str:
     """Return where and why no path goes on, and what may help, as a part of a sentence.
 
-    Args:
-        halt: what a straight push met.
-        at_mm: how far along the route it came, mm.
-        route: to the target.
-        navigation: with the wire and the limits.
+    `halt` is what a straight push met, which came to `at_mm` along the route.
     """
     device = navigation.device
     if halt == "late":
         return f"the {navigation.seconds:g} s are over; give more seconds"
     if navigation.catheters:
         return f"no manoeuvre leads past {at_mm:.0f} mm; give another catheter, wire or tip"
-    near = near_fork(at_mm, route, navigation)
+    reach = 0.5 * device.diameter_mm + BEYOND_MM + ENTERED_MM
+    at = (each for each in forks(route, device) if abs(at_mm - each.abscissa) <= 0.5 * each.width_mm + reach)
+    near = next(at, None)
     where = f"at {near}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
     if halt == "pressed":
         limit = (

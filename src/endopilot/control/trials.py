@@ -19,6 +19,7 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 from endopilot.types import Anatomy, TipProjection
 
+Each = Float[np.ndarray, "trials"]
 Control = Float[np.ndarray, "trials devices 2"]
 """Translation (mm/s) and rotation (rad/s) of each device of each trial in a decision period."""
 _SHORT_MM = 1.0
@@ -31,20 +32,6 @@ _TIP = tuple(TipProjection.__dataclass_fields__)
 
 WIRE, CATHETER = 0, 1
 """Places of devices in a stack: the wire, and the catheter next to it."""
-
-
-class Move(NamedTuple):
-    """What a device of each trial is to do in a decision period.
-
-    Attributes:
-        device: its place in the stack.
-        translation: mm/s; it is advanced, or retracted where this is negative.
-        rotation: rad/s.
-    """
-
-    device: int
-    translation: Float[np.ndarray, "trials"] | float = 0.0
-    rotation: Float[np.ndarray, "trials"] | float = 0.0
 
 
 class Period(NamedTuple):
@@ -69,11 +56,6 @@ class Kept(NamedTuple):
     state: SimulatorState
     rows: list[Period]
 
-    @property
-    def periods(self) -> int:
-        """How many periods they had done."""
-        return len(self.rows)
-
 
 class Trials:
     """Trials of a stack that are driven side by side.
@@ -94,14 +76,7 @@ class Trials:
     def __init__(
         self, simulator: Simulator, limits: Sequence[DriveLimits], *, wires: int = 1, budget: Budget | None = None
     ) -> None:
-        """Take worlds as trials.
-
-        Args:
-            simulator: the worlds.
-            limits: of the drive of each device.
-            wires: number of wires among the worlds, see `Trials`.
-            budget: that driving takes off; none if not given.
-        """
+        """Take worlds as trials: of so many wires, within the limits of each device's drive, driven at a budget."""
         self.simulator, self.wires, self._budget = simulator, wires, budget or Budget()
         self.count, self.devices = simulator.worlds // wires, simulator.devices
         self._limits, self.fastest = list(limits), limits[0].fastest
@@ -117,15 +92,7 @@ class Trials:
         like: Simulator,
         budget: Budget | None = None,
     ) -> Trials:
-        """Return trials of a navigation's devices.
-
-        Args:
-            navigation: what is to be done.
-            kinds: vessels and devices that are held possible.
-            count: number of trials.
-            like: a simulator of the same anatomies, whose settings are taken.
-            budget: as above.
-        """
+        """Return so many trials of the vessels and devices that are held possible, `like` a simulator of these."""
         anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
         simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=[like])
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
@@ -135,12 +102,8 @@ class Trials:
         return Trials(simulator, limits, wires=len(kinds), budget=budget)
 
     def put(self, source: Int[np.ndarray, "wires"], of: Simulator, weight: Float[np.ndarray, "wires"]) -> None:
-        """Put all trials of each wire where a world of a simulator of equal stacks is, and forget what they have done.
-
-        Args:
-            source: the world that is taken for each wire.
-            of: the simulator.
-            weight: of the wires.
+        """Put all trials of each wire where its source, a world `of` a simulator of equal stacks, is, and forget what
+        they have done.
         """
         self.simulator.copy_worlds(np.repeat(source, self.count), of=of)
         self._forget(weight)
@@ -211,11 +174,12 @@ class Trials:
         """Return where something holds for all wires that count."""
         return np.asarray(holds.reshape(self.wires, -1)[self.counted].all(axis=0))
 
-    def control(self, *moves: Move) -> Control:
-        """Return the control that makes some moves; a device that none names rests."""
+    def control(self, *speeds: Each | float, turn: Each | float = 0.0) -> Control:
+        """Return the control that moves devices, the wire first, at some speeds, mm/s, and turns the wire, rad/s."""
         control = np.zeros((self.count, self.devices, 2))
-        for device, translation, rotation in moves:
-            control[:, device, 0], control[:, device, 1] = translation, rotation
+        for device, speed in enumerate(speeds):
+            control[:, device, 0] = speed
+        control[:, WIRE, 1] = turn
         return control
 
     def possible(self, control: Control) -> Control:
@@ -228,11 +192,8 @@ class Trials:
         return made
 
     def move(self, control: Control, *, force_n: float = np.inf) -> Bool[np.ndarray, "trials"]:
-        """Drive for a decision period, as far as the drives can; return which press too hard, or fail.
-
-        Args:
-            control: of each trial; those that stand still do nothing.
-            force_n: wall force on a node that is too hard beyond it, N.
+        """Drive those that do not stand still for a decision period, as far as the drives can; return which press on a
+        node of the wall with more than a force, N, or fail.
         """
         step = self.drive(self.possible(np.where(self.still[:, None, None], 0.0, control)))
         return ~self.all(step.valid & (step.contact_force_max <= force_n))
@@ -260,13 +221,8 @@ class Trials:
         self.rows = list(kept.rows)
 
     def as_course(self, *, reached: float, ostium_mm: float, settled: Sequence[int] | None) -> Course:
-        """Return what the first trial has done as a course.
-
-        Args:
-            reached: whether it ends at the target, by weight.
-            ostium_mm: how much deeper the devices of the first wire lie than the encoders say, mm.
-            settled: periods at whose ends a manoeuvre is over: there the course is checked, under X-ray. If None, it is
-                checked at every period without.
+        """Return what the first trial has done as a course, whose first wire's devices lie `ostium_mm` deeper than the
+        encoders say. It is checked, under X-ray, at the end of the periods `settled`; if None, at every one without.
         """
         ends = np.isin(np.arange(len(self.rows)), settled or ())
         columns = {name: np.array([getattr(row.tip, name) for row in self.rows]) for name in _TIP}
@@ -289,15 +245,9 @@ def drive_period(
     control: Float[np.ndarray, "worlds *devices 2"],
     budget: Budget | None = None,
 ) -> Step:
-    """Drive all worlds for a decision period; a world that fails stays where it was.
+    """Drive all worlds for a decision period, at a budget; a world that fails stays where it was.
 
-    Args:
-        simulator: of the wires.
-        control: mm/s and rad/s of each wire, then of its catheters.
-        budget: that each part of the period is taken off.
-
-    Returns:
-        The worlds at the end of the period, but with the largest `contact_force_max` within it.
+    The worlds at the end of the period are returned, but with the largest `contact_force_max` within it.
     """
     steps = list[Step]()
     for _ in range(_LOOKS):

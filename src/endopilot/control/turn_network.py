@@ -50,14 +50,7 @@ class ForkView:
 
     @staticmethod
     def of(route: Route, at_mm: float, nodes: Float[np.ndarray, "nodes 3"], device: Wire) -> ForkView:
-        """Return what is seen of a place of a route.
-
-        Args:
-            route: to the target.
-            at_mm: abscissa of the place, mm.
-            nodes: of the wire, its tip first, LPS mm.
-            device: the wire.
-        """
+        """Return what is seen of a place of a route, abscissa mm, by a wire with these nodes, its tip first, LPS mm."""
         here = route.position(at_mm)
         axes = _axes(route, at_mm)
         ahead = _sampled(route.line, at_mm + _ROUTE_MM, here, axes)
@@ -174,11 +167,7 @@ class TurnNetwork:
 
     @staticmethod
     def read(path: Path) -> TurnNetwork:
-        """Read one.
-
-        Raises:
-            InputError: there is none.
-        """
+        """Read one, or raise `InputError` where there is none."""
         try:
             with np.load(path) as held:
                 count = sum(name.startswith("w") for name in held.files)

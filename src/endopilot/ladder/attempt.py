@@ -83,14 +83,8 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, terms: Terms | No
     """Let a policy drive a navigation, and return its figures, its course and its recording.
 
     `decision_s` is the wall time that each decision took, s, and `planning_s`, where the policy searches, the time
-    that its searches took. They are no figures: they differ from run to run.
-
-    Args:
-        seed: of encoder noise, detection errors and the policy.
-        terms: robot and world; where its patients are drawn, the policy runs in a process of its own (`Apart`).
-
-    Raises:
-        InputError: there is no such policy, or the wire does not fit the vessel.
+    that its searches took. They are no figures: they differ from run to run. On terms whose patients are drawn, the
+    policy runs in a process of its own (`Apart`). A policy that is none, or a wire that does not fit, is an InputError.
     """
     terms = terms or Terms()
     with Apart(policy) if terms.request else nullcontext(make_policy(policy)) as driver:
@@ -108,12 +102,7 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
     course = {
         "time_s": record.time_s.tolist(),
-        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
-        "rotation": record.rotation[:, 0].round(4).tolist(),
-        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
-        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
         "tip_position": record.tip_position[:, 0].round(3).tolist(),
-        "contact_force_max": record.contact_force_max.round(5).tolist(),
         "exposed": record.exposed.tolist(),
     }
     return _figures(navigation, record, recording) | {"course": course, "recording": recording.packed()}

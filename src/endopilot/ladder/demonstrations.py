@@ -35,14 +35,9 @@ _CHANNELS = 3
 def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[str, Any]:
     """Drive the navigations of a submission again, and write what was seen and decided as a LeRobot v3 data set.
 
-    An episode is a navigation, a sample a decision, two a second; docs/concepts/dataset.md describes the columns.
-
-    Returns:
-        `dataset` (the folder), `episodes`, `samples` and `exposures`.
-
-    Raises:
-        InputError: the file is no submission, its tasks have different numbers of devices, or the folder holds
-            something else.
+    An episode is a navigation, a sample a decision, two a second; docs/concepts/dataset.md describes the columns. The
+    folder and numbers are returned. InputError where the file is no submission, its tasks have different numbers of
+    devices, or the folder holds something else.
     """
     path, output = Path(submission), Path(output)
     read, key = read_submission(path), sha256(path)

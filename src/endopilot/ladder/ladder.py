@@ -103,17 +103,9 @@ def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dic
     """Let a policy do the tasks in their patients, and score it.
 
     Each navigation leaves one file, `output`/TASK/PATIENT.json; an interrupted run goes on with the others.
-
-    Args:
-        output: folder of the results; `ladder.json` in it holds the scores, `submission.json` what others need to
-            confirm them.
-        config: what climbs.
-
-    Returns:
-        A row a task and then rows over several tasks, see `endopilot.ladder.scores.score`.
-
-    Raises:
-        InputError: the folder belongs to another run, such as that of another policy, or a navigation cannot be begun.
+    `ladder.json` holds the scores, `submission.json` what others need to confirm them. The rows of
+    `endopilot.ladder.scores.score` are returned. InputError where the folder belongs to another run, such as that of
+    another policy, or a navigation cannot be begun.
     """
     config = config or LadderConfig()
     output = Path(output)

@@ -28,13 +28,9 @@ CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less
 def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[dict[str, Any]]:
     """Let a policy do tasks of the ladder under model mismatch, and score it in each case.
 
-    Each navigation leaves one file, `output`/CASE/TASK/PATIENT.json; an interrupted run goes on with the others.
-
-    Each of `QUANTITIES` differs by `share`, up and down, between 0 and 1. A row for each of `CASES` is returned, and
-    stands in `output`/mismatch.json: over all navigations what `endopilot.ladder.scores.score_navigations` gives.
-
-    Raises:
-        InputError: `share` is out of its range, the folder belongs to another run, or a navigation cannot be begun.
+    Each of `QUANTITIES` differs by `share`, up and down, between 0 and 1; files and errors are those of `climb`, one
+    folder a case. A row for each of `CASES` is returned, and stands in `output`/mismatch.json: over all navigations
+    what `score_navigations` gives.
     """
     if not 0 < share < 1:
         raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")

@@ -252,14 +252,8 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
 
     They are driven with the file's kernel of linear algebra, one of `KERNELS`. A policy that is at hand also decides
     again: its exposures are counted then. Where it decides otherwise, the file fails, whatever version it names.
-
-    Args:
-        path: the file.
-        policy: MODULE:OBJECT of the file's policy, where you have it and trust it; shipped ones are at hand.
-
-    Raises:
-        InputError: the file is no submission, its tasks or seeds are not those of this ladder, or it was made with a
-            kernel that nobody can drive it again with.
+    Shipped policies are at hand; `policy` is MODULE:OBJECT of the file's, where you have it and trust it. InputError
+    where the file is no submission of this ladder, or was made with a kernel that nobody can drive it again with.
     """
     submission = read_submission(path)
     kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
@@ -352,13 +346,8 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
 
 
 def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, Recording]:
-    """Return the task, the patient's place in its list, and the recording of one navigation.
-
-    Args:
-        path: a submission.json, or TASK/NUMBER.json of a ladder's folder, which tells task and place by itself.
-
-    Raises:
-        InputError: the file is none of the ladder, or has no such navigation.
+    """Return the task, the patient's place in its list, and the recording of one navigation in a submission.json, or in
+    TASK/NUMBER.json of a ladder's folder, which tells task and place by itself; InputError where there is none.
     """
     content = read_json(path)
     if isinstance(content, dict) and "navigations" in content:

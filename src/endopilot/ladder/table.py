@@ -29,10 +29,8 @@ def tabulate(*folders: Path) -> list[dict[str, Any]]:
     A row holds `terms` (`Terms.key`; only rows of equal terms may be compared), `task`, or how many together, `policy`,
     `source` ("run": driven here; "file": as a submission says, which `--check` confirms or not), the number of
     `navigations`, what `score_navigations` gives, and how long decisions took, ms: `decision_ms` and `p99_ms`, their
-    median and 99th percentile; of a submission as it says, over all its tasks.
-
-    Raises:
-        InputError: there is nothing, or the scores of an older version, which do not tell their terms.
+    median and 99th percentile; of a submission as it says, over all its tasks. InputError where there is nothing, or
+    the scores of an older version, which do not tell their terms.
     """
     rows = list[dict[str, Any]]()
     for terms, policy, source, results, took_ms in (run for folder in folders for run in _runs(folder)):

@@ -106,7 +106,8 @@ class CatheterAlone:
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Take the target's depth, or raise `InputError` where there is no catheter."""
-        check_catheter(navigation)
+        if not navigation.catheters:
+            raise InputError("policy: drives a catheter too, and there is none; give a catheter, or another policy")
         self._deepest = navigation.target.abscissa + _SLACK_MM
 
     def decide(self, observation: Observation) -> Decision:
@@ -133,9 +134,3 @@ class InTurn(CatheterAlone):
         if self._follows:
             return Decision((_STAND, _ADVANCE))
         return Decision((_ADVANCE if leads else _STAND,))
-
-
-def check_catheter(navigation: Navigation) -> None:
-    """Raise `InputError` where a navigation has no catheter, for policies that drive one."""
-    if not navigation.catheters:
-        raise InputError("policy: drives a catheter too, and there is none; give a catheter, or another policy")

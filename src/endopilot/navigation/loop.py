@@ -208,11 +208,7 @@ class NavigationLoop:
         return self.take(self.decide(self.observe()))
 
     def observe(self) -> Observation:
-        """Read encoders and loads, and expose where the last decision asked for it.
-
-        Raises:
-            ValueError: the navigation is over, or the last period is not.
-        """
+        """Read encoders and loads, and expose where the last decision asked for it; ValueError where none is due."""
         if self.reason is not None or not self.between_periods:
             raise ValueError("the navigation is over" if self.reason else "the period is not over; call advance")
         state, tip = self.robot.proximal_state(), None
@@ -302,10 +298,8 @@ def start_world(
 ) -> Simulator:
     """Return the world as it truly is, with the wire and its catheters at the start of the navigation.
 
-    Devices slip in the grip of `robot`, or at their own limits; the vessel lies still without `motion`.
-
-    Raises:
-        InputError: the wire does not fit the vessel, or starts deeper than it is long.
+    Devices slip in the grip of `robot`, or at their own limits; the vessel lies still without `motion`. InputError
+    where the wire does not fit the vessel, or starts deeper than it is long.
     """
     stack, config = world.stack(navigation.stack), world.core(config)
     if robot is not None:

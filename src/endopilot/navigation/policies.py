@@ -34,8 +34,7 @@ _MORE_METHODS = ("believed", "watch")
 def make_policy(name: str) -> Policy:
     """Return a new policy: one of `POLICIES`, or of MODULE:OBJECT, a class or function of one's own that makes it.
 
-    Raises:
-        InputError: there is no such policy, it cannot be made without arguments, or it has no `start` or `decide`.
+    InputError where there is none, it cannot be made without arguments, or has no `start` or `decide`.
     """
     kind = POLICIES.load(name)
     if not callable(kind):

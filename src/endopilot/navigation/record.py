@@ -93,10 +93,8 @@ class NavigationRecord:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The true motion at the end of each decision period, with the shape of the line that the devices share.
-
-        Raises:
-            ValueError: no period is over.
+        """The true motion at the end of each decision period, with the shape of the line that the devices share;
+        ValueError where no period is over.
         """
         if self.cycles is None:
             raise ValueError("nothing was driven yet")
@@ -117,10 +115,7 @@ def count_navigation_events(
     record: NavigationRecord, navigation: Navigation, advice: AdviserConfig | None = None
 ) -> dict[str, Counted]:
     """Return what X-ray had to show in a navigation, and what it missed (`belief.events`): contacts with the wall, tips
-    that were astray of where the policy believed them, and forces beyond the limit.
-
-    Args:
-        advice: τ and δ.
+    that were astray of where the policy believed them, and forces beyond the limit. `advice` has τ and δ.
     """
     advice, tip = advice or AdviserConfig(), record.tip[:, 0]
     states = {

@@ -52,11 +52,7 @@ class Target:
         return reached(tip, self.branch, self.abscissa, self.near_mm or np.inf)
 
     def check(self, tree: VesselTree) -> None:
-        """Check that the place lies in a vessel.
-
-        Raises:
-            ValueError: no such branch, or it does not run there.
-        """
+        """Raise ValueError unless the place lies in a vessel, on a branch that runs there."""
         branches = tree.branches
         if not 0 <= self.branch < len(branches):
             raise ValueError(f"target.branch: {self.branch}; the vessel has branches 0 to {len(branches) - 1}")

@@ -24,11 +24,8 @@ def find_target(tree: VesselTree, place: Place, *, depth_mm: float | None = None
     """Return the target that is meant, as `Anatomy.target` says.
 
     The middle of a section lies on the branch that holds most of it. `depth_mm` counts in the branch where the section
-    begins, of several in the one that begins nearest to the ostium, and goes on in the straightest one.
-
-    Raises:
-        InputError: nothing is named, no such section, a section that ends before the depth, a point that is not three
-            finite numbers or lies outside the lumen, or a target outside the tree.
+    begins, of several in the one that begins nearest to the ostium, and goes on in the straightest one. InputError for
+    what is not there: a section, one that is deep enough, a point of three finite numbers in the lumen, a target.
     """
     if isinstance(place, Target):
         try:

@@ -174,16 +174,9 @@ class Task:
     def navigation(
         self, anatomy: Anatomy, *, start_rotation_rad: float = 0.0, target_mm: tuple[float, ...] | None = None
     ) -> Navigation:
-        """Return what is to be done in one of the task's patients.
+        """Return what is to be done in one of the task's patients, or raise `InputError` where there is no such place.
 
-        Args:
-            anatomy: the patient's.
-            start_rotation_rad: rotation of the wire at the start, rad.
-            target_mm: point nearest to which the target lies on the centerline, LPS mm; the task's section and depth
-                say where it lies if not given.
-
-        Raises:
-            InputError: the anatomy lacks the section, it is too short, or the point lies outside the lumen.
+        The target lies nearest to a point, LPS mm; the task's section and depth say where if none is given.
         """
         bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
         target = self.target(anatomy.tree) if target_mm is None else find_target(anatomy.tree, target_mm)
@@ -208,11 +201,7 @@ def _patient(atlas: AtlasConfig, number: int) -> Anatomy:
 
 @cache
 def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
-    """Return the tasks of a version of the ladder, the lowest first.
-
-    Raises:
-        InputError: there is no such version or folder, or a file in the folder is no task.
-    """
+    """Return the tasks of a version of the ladder, the lowest first, or raise `InputError` where there are none."""
     shipped = get_args(ShippedVersion)
     folder = Path(__file__).parent / f"ladder_{version}" if version in shipped else Path(str(version))
     tasks = [_read_task(path) for path in folder.glob("*.yaml")]
@@ -255,10 +244,7 @@ def training_navigations(name: str | None, first: int, count: int, version: Ladd
     """Return a task of the ladder in `count` of its training patients, from number `first` on.
 
     Without a name, all tasks of the version, one after another. A task of one's own that has no such patients is
-    returned in those that it is scored on.
-
-    Raises:
-        InputError: the ladder has no such task, or the task fewer patients.
+    returned in those that it is scored on. InputError where there is no such task, or it has fewer patients.
     """
     tasks = list_tasks(version) if name is None else (find_task(name, version=version),)
     return [
@@ -269,10 +255,8 @@ def training_navigations(name: str | None, first: int, count: int, version: Ladd
 
 
 def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
-    """Return navigations of wires alone with a catheter, named or in a YAML file, around each, whose tip is to arrive.
-
-    Raises:
-        InputError: there is no such catheter, or a wire does not fit into it.
+    """Return navigations of wires alone with a catheter, named or in a YAML file, around each, whose tip is to arrive;
+    InputError where there is none, or a wire does not fit into it.
     """
     catheter = read_catheter(name)
     return [replace(navigation, catheters=(catheter,), arrives="catheter") for navigation in navigations]
