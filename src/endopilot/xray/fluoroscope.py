@@ -17,15 +17,14 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
-from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.settings import Finite, Positive, settings
-from endopilot.simulation.motion import Motion, place, published_mean
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
-from endopilot.types import Anatomy, TipProjection
+from endopilot.types import Anatomy
 from endopilot.xray.carm import CArmGeometry, View, view_at
-from endopilot.xray.moving_patient import seen_in_episodes, seen_wire, turned
+from endopilot.xray.moving_patient import seen_wire
 
 _CATHETER_MM = 20.0
 """Length of the guiding catheter behind the ostium that is straight, in which a tip may be found, mm."""
@@ -262,30 +261,6 @@ class Fluoroscope:
     ) -> Float[np.ndarray, "3"]:
         """Return the position, LPS mm, that `measure` finds."""
         return self._likeliest(tip_position, tip_direction, inserted_length, random)[0][0]
-
-    def expose_episodes(
-        self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
-    ) -> TipProjection:
-        """Return where an exposure would show the tip, at every sample of episodes of this patient.
-
-        Where the patient moves, it shows the tip where it is then, less the published mean of that motion. Δ by the
-        encoder, mm, helps to find the tip. A navigation's errors depend on seed, patient and sequence alone.
-        """
-        tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
-        tip = tip + self.registration_mm
-        position, name = np.zeros_like(tip), self._anatomy.name
-        ostium = np.asarray(self._anatomy.insertion.position)
-        motion = episodes.motion(name)
-        known = None if motion is None else published_mean(motion)
-        shown = seen_in_episodes(motion, known, ostium, tip.shape[1], episodes.sample_period_s)
-        if shown is not None:
-            tip, heading = place(shown, tip), turned(shown, heading)
-        for index, sequence in enumerate(episodes.sequence):
-            random = np.random.default_rng([seed, 3, int(sequence), *name.encode()])
-            for sample in range(position.shape[1]):
-                depth = float(inserted_length[index, sample])
-                position[index, sample] = self.locate(tip[index, sample], heading[index, sample], depth, random)
-        return self._project(position)
 
     def _detect(
         self,
