@@ -150,13 +150,11 @@ class ImageFluoroscope:
         nodes: Float[np.ndarray, "n 3"],
         inserted_length: float,
         random: np.random.Generator,
-        *,
-        refine: bool = True,
     ) -> TipMeasurement | None:
         """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be.
 
-        None where no wire is found. One whose tip is not ambiguous refines, or not, the pose that later exposures take
-        the patient to lie in.
+        None where no wire is found. One whose tip is not ambiguous refines the pose that later exposures take the
+        patient to lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
@@ -164,7 +162,7 @@ class ImageFluoroscope:
         found = self._detector.find(views, signals, photons, inserted_length, before=self._before, displaced=covariance)
         if found is None:
             return None
-        if refine and self.known_motion is None:
+        if self.known_motion is None:
             self.displaced.update(found)
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
