@@ -166,8 +166,11 @@ def make_toy_dataset(
         generate_dataset(anatomies, output=folder, device=read_wire(device), config=config, scheduler=scheduler)
 
 
-def make_untrained_run(dataset_folder, run_folder):
-    """Write a run whose networks are their simple guesses: slack and offset stay; the drive moves as the tip is to."""
+def make_untrained_run(dataset_folder, run_folder, patients=None):
+    """Write a run whose networks are their simple guesses: slack and offset stay; the drive moves as the tip is to.
+
+    Its patients are those of the data set to train on, if none are given.
+    """
     from endopilot.models.checkpoint import write_network
     from endopilot.models.config import TransformerConfig
     from endopilot.models.paper import NETWORKS
@@ -175,10 +178,13 @@ def make_untrained_run(dataset_folder, run_folder):
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():
         write_network(run_folder / f"{name}.safetensors", name, network(size), size)
-    device, data = read_json(dataset_folder / "meta" / "manifest.json")["device"], read_dataset(dataset_folder)
+    device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
+    if patients is None:
+        data = read_dataset(dataset_folder)
+        patients = [data.patients[name] for name in set(data.of_split("train").anatomy.tolist())]
     record = {
         "config": {"model": "paper"},
-        "patients": [data.patients[name] for name in set(data.of_split("train").anatomy.tolist())],
+        "patients": patients,
         "dataset": os.path.relpath(dataset_folder, run_folder),
         "networks": {"ff": {}, "if": {}},
         "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},

@@ -271,7 +271,7 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
     first = policy._follower.course
     assert first is not None and first.reached == 1
     for _ in range(50):  # four times the force, and what prior and margin take
-        policy.monitor._loads.take(0.86, 0.2, speed_mm_s=5.0, valve=(0.0, 0.0))
+        policy.monitor._loads.take(0.86, 0.2)
     assert policy.monitor.load_ratio == pytest.approx(4.0, abs=0.05)
     policy._failed, plans = policy.config.tries, policy.plans  # failed searches are forgotten
     decide(1)

@@ -209,7 +209,7 @@ def test_a_dataset_that_was_trained_on_as_a_whole_is_refused(trained_on, tmp_pat
 
 def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
     metrics = evaluated[1]
-    monkeypatch.setattr("endopilot.cli.evaluate.evaluate", lambda *_, **__: metrics)
+    monkeypatch.setattr("endopilot.cli.data.evaluate", lambda *_, **__: metrics)
     monkeypatch.setattr("endopilot.report.report.report_evaluation", lambda _: None)
     with pytest.raises(SystemExit, match="0"):
         main(["evaluate", "r", "-o", "out"])

@@ -31,7 +31,7 @@ def a_run(tmp_path_factory) -> Path:
         folder / "dataset" / "meta" / "manifest.json", {"key": "k", "device": asdict(read_wire("workhorse-014"))}
     )
     (folder / "run").mkdir()
-    make_untrained_run(folder / "dataset", folder / "run")
+    make_untrained_run(folder / "dataset", folder / "run", patients=[])
     return folder / "run"
 
 

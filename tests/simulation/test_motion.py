@@ -128,8 +128,10 @@ def test_a_contracting_vessel_loads_the_wire(anatomy: Anatomy) -> None:
 def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:
     write_anatomy(anatomy, output=tmp_path / "bend")
     random = command.RandomConfig(sequences=2, seconds=2.0)
-    command.command(tmp_path / "bend", output=tmp_path / "still.csv", random=random)
-    command.command(tmp_path / "bend", output=tmp_path / "both.csv", motion="both", motion_seed=5, random=random)
+    command.simulate_command(tmp_path / "bend", output=tmp_path / "still.csv", random=random)
+    command.simulate_command(
+        tmp_path / "bend", output=tmp_path / "both.csv", motion="both", motion_seed=5, random=random
+    )
     still, moving = (pd.read_csv(tmp_path / name) for name in ("still.csv", "both.csv"))
     told = [f"tip_laboratory_{axis}_mm" for axis in "xyz"]
     assert set(moving.columns) - set(still.columns) == set(told)
