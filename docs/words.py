@@ -11,14 +11,14 @@ BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
 """Most words of a page's prose, by its shelf."""
 LONGER = {
     "evidence/anatomy.md": 450,
-    "evidence/detection.md": 790,
-    "evidence/environments.md": 720,
+    "evidence/detection.md": 420,
+    "evidence/environments.md": 410,
     "evidence/leaderboard.md": 370,
     "evidence/navigation.md": 350,
-    "evidence/planning.md": 600,
+    "evidence/planning.md": 330,
     "evidence/reality.md": 1240,
     "evidence/robustness.md": 400,
-    "evidence/worlds.md": 600,
+    "evidence/worlds.md": 380,
 }
 """Pages that are still longer than their shelf allows, and their own bounds: a ratchet, lowered as they get shorter."""
 _GENERATED = r"<!-- (.+?):begin -->.*?<!-- \1:end -->"
