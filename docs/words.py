@@ -10,15 +10,14 @@ FOLDER = Path(__file__).parent
 BOUNDS = {"guide": 400, "concepts": 1000, "evidence": 200}
 """Most words of a page's prose, by its shelf."""
 LONGER = {
-    "evidence/anatomy.md": 450,
-    "evidence/detection.md": 790,
-    "evidence/environments.md": 720,
-    "evidence/leaderboard.md": 370,
-    "evidence/navigation.md": 350,
-    "evidence/planning.md": 600,
+    "evidence/anatomy.md": 330,
+    "evidence/detection.md": 420,
+    "evidence/environments.md": 410,
+    "evidence/leaderboard.md": 290,
+    "evidence/planning.md": 330,
     "evidence/reality.md": 1240,
-    "evidence/robustness.md": 400,
-    "evidence/worlds.md": 600,
+    "evidence/robustness.md": 250,
+    "evidence/worlds.md": 380,
 }
 """Pages that are still longer than their shelf allows, and their own bounds: a ratchet, lowered as they get shorter."""
 _GENERATED = r"<!-- (.+?):begin -->.*?<!-- \1:end -->"
