@@ -42,8 +42,8 @@ def card(task: Task, version: LadderVersion) -> list[str]:
     paletted = [frame.quantize(palette=first, dither=Image.Dither.NONE) for frame in shown]
     paletted[0].save(path, save_all=True, append_images=paletted[1:], duration=FRAME_MS, loop=0, optimize=True)
     where = f", {task.depth_mm:g} mm deep" if task.depth_mm else ", its middle"
-    facts = f"Target: section {task.section}{where}, for the {task.arrives or 'wire'}. {navigation.stack.name}; {navigation.seconds:g} s"
-    facts += f", {navigation.force_limit_n:g} N on the wall."
+    facts = f"Target: section {task.section}{where}, for the {task.arrives or 'wire'}. {navigation.stack.name}"
+    facts += f"; {navigation.seconds:g} s, {navigation.force_limit_n:g} N on the wall."
     head = f"## {task.name.title()}-v2"
     return [head, "", f"{task.title.capitalize()}. {facts}", "", f"![{task.name}](../images/tasks/{path.name})", ""]
 

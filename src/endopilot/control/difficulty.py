@@ -19,7 +19,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from endopilot.control.reach import forks
-from endopilot.devices.device import Wire
+from endopilot.devices.device import Wire, lateral_reach
 from endopilot.tasks.route import Route
 from endopilot.types import Anatomy, VesselTree
 
@@ -81,7 +81,8 @@ def difficulty(anatomy: Anatomy, wire: Wire, places: Sequence[str] = ()) -> list
         route = Route.to(anatomy, anatomy.target(place))
         shape = Shape.of(route)
         bore_mm = 2 * float(route.line.radius[route.line.abscissa <= route.target.abscissa].min()) - wire.diameter_mm
-        reaches = [_reach_mm(wire) / fork.width_mm for fork in forks(route, wire) if fork.width_mm > 0]
+        tip_mm = lateral_reach(wire.tip_bend_rad, wire.tip_bend_length_mm)
+        reaches = [tip_mm / fork.width_mm for fork in forks(route, wire) if fork.width_mm > 0]
         row = {"section": place, **asdict(shape), "bore_mm": bore_mm, "tip_reaches": float(min([1.0, *reaches]))}
         rows.append(row | (expected(shape) if bore_mm > 0 else _UNTOLD))
     return sorted(rows, key=lambda row: row["seconds"] or np.inf)
@@ -115,12 +116,6 @@ def arch_type(tree: VesselTree) -> str | None:
     wide_mm = 2 * float(np.quantile(carotid.radius, 0.75))  # neither the mouth in the aorta nor a stenosis
     diameters = drop_mm / wide_mm
     return "I" if diameters <= 1 else "II" if diameters <= 2 else "III"
-
-
-def _reach_mm(wire: Wire) -> float:
-    """Return how far a tip that is bent by θ over L stands beside the wire behind it, L(1 − cos θ)/θ, mm."""
-    bend = wire.tip_bend_rad
-    return wire.tip_bend_length_mm * (1 - np.cos(bend)) / bend if bend else 0.0
 
 
 def _features(shapes: Sequence[Shape]) -> Float[np.ndarray, "n 4"]:
