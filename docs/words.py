@@ -15,7 +15,7 @@ LONGER = {
     "evidence/environments.md": 410,
     "evidence/leaderboard.md": 290,
     "evidence/planning.md": 330,
-    "evidence/reality.md": 1240,
+    "evidence/reality.md": 1200,
     "evidence/robustness.md": 250,
     "evidence/worlds.md": 380,
 }
