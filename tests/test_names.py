@@ -34,8 +34,8 @@ ASKED = {
 
 
 VERBS = {
-    "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "locate", "make",
-    "navigate", "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
+    "assess", "calibrate", "check", "climb", "evaluate", "extract", "find", "generate", "list", "load", "locate",
+    "make", "navigate", "plan", "read", "replay", "segment", "simulate", "take", "train", "write",
 }  # fmt: skip
 SUBJECTS = {
     "anatomies", "anatomy", "control", "dataset", "device", "devices", "driven", "folder", "locations", "logs", "name",

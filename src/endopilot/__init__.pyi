@@ -8,6 +8,7 @@ from .atlas.atlas import AtlasConfig as AtlasConfig
 from .atlas.atlas import make_atlas as make_atlas
 from .belief.bands import Calibration as Calibration
 from .cockpit.recording import write_session_episode as write_session_episode
+from .control.difficulty import assess_difficulty as assess_difficulty
 from .control.navigate import NavigateConfig as NavigateConfig
 from .control.navigate import PatientNavigation as PatientNavigation
 from .control.navigate import SetUp as SetUp

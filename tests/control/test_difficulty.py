@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.control.difficulty import NAVIGATIONS_FILE, Shape, arch_type, difficulty, expected
+from endopilot.control.difficulty import NAVIGATIONS_FILE, Shape, arch_type, assess_difficulty, expected
 from endopilot.devices.device import read_wire
 from endopilot.tasks.route import Route
 from endopilot.types import Branch, VesselTree
@@ -25,7 +25,7 @@ def test_a_route_s_shape_is_that_of_its_line():
 
 def test_each_section_is_told_once_and_the_near_one_is_easier():
     wire = read_wire("workhorse-014")
-    near, far = difficulty(make_anatomy(), wire)
+    near, far = assess_difficulty(make_anatomy(), wire)
     assert (near["section"], far["section"]) == ("1", "2")
     assert near["bore_mm"] == pytest.approx(2 * RADIUS_MM - wire.diameter_mm)
     for measure in ("exposures", "seconds"):
@@ -38,7 +38,7 @@ def test_behind_a_place_narrower_than_the_wire_nothing_is_expected():
     branch = anatomy.tree.branches[0]
     radius = np.where(np.arange(81) == 30, 0.1, branch.centerline.radius)
     tree = VesselTree((Branch(replace(branch.centerline, radius=radius), -1, branch.section),), ("1", "2"))
-    rows = {row["section"]: row for row in difficulty(replace(anatomy, tree=tree), read_wire("workhorse-014"))}
+    rows = {row["section"]: row for row in assess_difficulty(replace(anatomy, tree=tree), read_wire("workhorse-014"))}
     assert rows["1"]["seconds"] > 0
     assert rows["2"]["seconds"] is None and rows["2"]["bore_mm"] < 0
 
@@ -68,7 +68,7 @@ def test_intervals_hold_in_real_arteries(measure, column):
 
 def test_expected_seconds_in_real_arteries_beat_the_mean_of_the_ladder():
     truth = np.log([row[4] for row in REAL])
-    table = np.genfromtxt(files("endopilot.control") / NAVIGATIONS_FILE, delimiter=",", names=True, dtype=None)
+    table = np.genfromtxt(str(files("endopilot.control") / NAVIGATIONS_FILE), delimiter=",", names=True, dtype=None)
     errors = np.abs(truth - np.log([each["seconds"] for each in told_of_real()]))
     assert errors.mean() < 0.5 * np.abs(truth - np.log(table["seconds"]).mean()).mean()
 

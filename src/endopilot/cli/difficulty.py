@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Answer, Existing
-from endopilot.control.difficulty import arch_type, difficulty
+from endopilot.control.difficulty import arch_type, assess_difficulty
 from endopilot.devices.device import read_wire
 
 
@@ -23,7 +23,7 @@ def difficulty_command(
         device: name of a device (`endopilot devices`) or a YAML file.
     """
     patient = read_anatomy(anatomy)
-    rows = difficulty(patient, read_wire(device), target)
+    rows = assess_difficulty(patient, read_wire(device), places=target)
     kind = arch_type(patient.tree)
     return Answer(rows, [*([f"aortic arch of type {kind}"] if kind else []), [_shown(row) for row in rows]])
 

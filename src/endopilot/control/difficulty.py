@@ -1,4 +1,4 @@
-"""How hard a patient is, before a procedure: `difficulty`, from geometry and from what the ladder's navigations took.
+"""How hard a patient is, told before a procedure from geometry and from the ladder's navigations: `assess_difficulty`.
 
 A linear model tells the time and the exposures that a target will take from the ladder's 240 navigations by `agent`:
 log y = b₀ + b₁ log length + b₂ turning + b₃ forks. `difficulty.csv` holds these navigations; docs/figures/difficulty.py
@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from endopilot.control.reach import forks
 from endopilot.devices.device import Wire, lateral_reach
+from endopilot.settings import public
 from endopilot.tasks.route import Route
 from endopilot.types import Anatomy, VesselTree
 
@@ -58,7 +59,8 @@ class Shape:
         return Shape(route.target.abscissa, float(turning), len(route.junctions))
 
 
-def difficulty(anatomy: Anatomy, wire: Wire, places: Sequence[str] = ()) -> list[dict[str, Any]]:
+@public
+def assess_difficulty(anatomy: Anatomy, wire: Wire, *, places: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Return how hard each section of a vessel is to reach, the easiest first.
 
     Args:
