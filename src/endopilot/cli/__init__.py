@@ -55,14 +55,13 @@ COMMANDS = {
 """Name of each command: what it takes -> what it makes."""
 _TOGETHER = {
     "stages": "demo run",
-    "patients": "segment anatomy atlas phantom",
+    "patients": "anatomy atlas phantom",
     "data": "dataset dataset-info train evaluate",
     "navigation": "plan navigate",
-    "images": "xray locate angiograms advise",
-    "robots": "drive replay calibrate",
-    "checks": "verify devices sample",
+    "robots": "replay calibrate",
+    "checks": "verify devices",
 }
-"""Modules of several commands; all others have a module of their own name."""
+"""Modules of several commands that import about the same; all others have a module of their own name."""
 GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models"}
 GROUPS |= {
     "difficulty": "Navigation",

@@ -1,8 +1,8 @@
-"""`endopilot verify`, `devices` and `sample`: the core against closed forms, the known wires, a CT to try."""
+"""`endopilot verify` and `devices`: the core against closed forms, and the known wires."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from tyro.conf import Positional
 
@@ -11,7 +11,6 @@ from endopilot.devices.catheter import catheter_yaml, list_catheters
 from endopilot.devices.device import read_wire
 from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_wires, user_devices
 from endopilot.errors import InputError
-from endopilot.imaging.sample import fetch_sample
 from endopilot.simulation.tip_load import tip_load_row
 from endopilot.verification import free_rod
 from endopilot.verification.case import run
@@ -64,12 +63,3 @@ def _yaml(name: str) -> str:
 def _row(name: str) -> dict[str, Any]:
     path = device_file(name)
     return read_wire(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}
-
-
-def sample_command(name: Positional[Literal["cta-thorax"]] = "cta-thorax", /) -> None:
-    """Download a real thoracic CT angiogram, check it, and print its path, licence and source.
-
-    Args:
-        name: which sample.
-    """
-    print(fetch_sample(name))

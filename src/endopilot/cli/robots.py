@@ -1,11 +1,7 @@
-"""`endopilot drive`, `replay` and `calibrate`: a simulated drive, and what a real one logged."""
+"""`endopilot replay` and `calibrate`: what a real robot logged."""
 
 from __future__ import annotations
 
-import asyncio
-import signal
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,49 +11,17 @@ from tyro.conf import Positional
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Answer, Existing, Figures, ListenConfig, OutputFile, OutputFolder
+from endopilot.cli.arguments import Answer, Existing, Figures, OutputFile, OutputFolder
 from endopilot.devices.catheter import write_device
 from endopilot.devices.device import read_wire
-from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.robot import ASSUMED, read_robot
+from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
 from endopilot.files import input_hash, manifest, write_json, writing
 from endopilot.plotting import png
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
-from endopilot.robot.drive import Drive, serve, tls_context
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
 from endopilot.runs import check_new, claim
-from endopilot.settings import Finite
-
-
-def drive_command(
-    *,
-    certificates: Path,
-    device: str = "workhorse-014",
-    travel_mm: tuple[Finite, Finite] = (0.0, 300.0),
-    listen: ListenConfig = ListenConfig(port=7345),
-    robot: str = ASSUMED,
-) -> None:
-    """Run a simulated robotic drive until Ctrl-C, over TLS (docs/concepts/drive-protocol.md). No medical device.
-
-    Args:
-        certificates: folder with drive.key, drive.crt and client.crt; docs/concepts/drive-protocol.md makes them.
-        device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
-        travel_mm: least and largest inserted length, mm.
-        listen: the drive's address.
-        robot: name of a robot (docs/concepts/robot.md) or a YAML file: latency, accelerations and noise.
-    """
-    wire = read_wire(device)
-    limits = DriveLimits(
-        max_velocity_mm_s=wire.max_velocity_mm_s, max_rotation_rad_s=wire.max_rotation_rad_s, travel_mm=travel_mm
-    )
-    context = tls_context(certificates, of_drive=True)
-    low, high = travel_mm
-    drive = Drive(limits, now=time.monotonic(), config=read_robot(robot), inserted_length=min(max(low, 0.0), high))
-    asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
-    print("endopilot drive: terminated", file=sys.stderr)
-    sys.exit(128 + signal.SIGTERM)
 
 
 def replay_command(

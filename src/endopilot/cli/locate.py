@@ -1,4 +1,4 @@
-"""`endopilot xray`, `locate`, `angiograms` and `advise`: X-ray images, tips in them, and when to take one."""
+"""`endopilot locate`: vessel and X-ray images, or lines in them -> the tip in three dimensions, frame by frame."""
 
 from __future__ import annotations
 
@@ -12,43 +12,13 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy
-from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.belief.advise import FIGURES_FILE, PICTURE_FILE, advise
-from endopilot.belief.monitoring import AdviseConfig
-from endopilot.cli.arguments import Answer, Existing, Figures, OutputFile, OutputFolder, Page, Picture
+from endopilot.cli.arguments import Existing, Figures, OutputFile, Page, Picture
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import read_json
-from endopilot.imaging.volume import read_volume
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
-from endopilot.xray.take_image import TakeImageConfig, take_image
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
-
-
-def xray_command(
-    anatomy: Positional[Existing],
-    /,
-    *,
-    output: OutputFile,
-    ct: Existing | None = None,
-    config: TakeImageConfig = TakeImageConfig(),
-) -> Figures:
-    """Push a wire, alone or in a catheter, into a vessel, and take an X-ray image: fluoroscopy, contrast, DSA, roadmap.
-
-    Args:
-        output: the image, .png.
-        ct: CT angiogram of the patient, HU; a synthetic chest around a coronary artery, else water, if not given.
-    """
-    volume = None if ct is None else read_volume(ct)
-    image = take_image(read_anatomy(anatomy), config=config, ct=volume)
-    image.write(output)
-    tip = None if image.tip_pixel is None else [round(float(value), 2) for value in image.tip_pixel]
-    figures = {"image": output, "tip_row_column": tip, "mm_per_pixel": round(image.mm_per_pixel, 4)}
-    if volume is not None and volume.notes:
-        figures["ct_notes"] = list(volume.notes)
-    return figures | {"frames": image.frames, "air_kerma_ugy": round(image.air_kerma_ugy, 3)}
 
 
 def locate_command(
@@ -154,78 +124,3 @@ def _in_images(
     }
     said = [f"registered {figures['registered']}; image and vessel agree by {figures['agreement']}", *found.notes]
     return found.tips, drawn, figures, said
-
-
-def angiograms_command(
-    patients: Positional[tuple[Existing, ...]],
-    /,
-    *,
-    output: OutputFolder,
-    device: str = "workhorse-014",
-    catheter: tuple[str, ...] = (),
-    scheduler: str | None = None,
-    config: AngiogramsConfig = AngiogramsConfig(),
-) -> Figures:
-    """Make X-ray cines of patients' vessels, with contrast, motion and devices, and the truth of each frame.
-
-    An interrupted run goes on where it stopped when the same command is given again.
-
-    Args:
-        patients: folders made by `endopilot anatomy` or `endopilot atlas`, or CT angiograms, which are segmented.
-        output: folder of the data set.
-    """
-    from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
-    from endopilot.angiograms.make import make_angiograms
-
-    make_angiograms(patients, output=output, device=Stack.of(device, *catheter), config=config, scheduler=scheduler)
-    splits = read_json(output / MANIFEST_FILE)["splits"]
-    return {
-        "data_set": output,
-        **{f"{split}_{what}": count for split, counts in splits.items() for what, count in counts.items()},
-        "samples": output / SAMPLES_FILE,
-    }
-
-
-def advise_command(
-    run: Positional[Path],
-    dataset: Positional[Existing],
-    /,
-    *,
-    output: OutputFolder,
-    also_test: tuple[Existing, ...] = (),
-    config: AdviseConfig = AdviseConfig(),
-) -> Answer:
-    """Calibrate the X-ray adviser of a run, and measure on unseen patients which events it misses.
-
-    The adviser asks for X-ray before the tip may be at the wall or far from where the model predicts it.
-
-    Args:
-        run: folder made by `endopilot train`; the calibration, xray.json, is written into it. Or `wires`,
-            the simulated wires; the calibration is then written to the output.
-        dataset: folder made by `endopilot dataset`, with at least 9 patients in its split 'calibrate'.
-        output: folder of advice.json and advice.png.
-        also_test: datasets that were made otherwise, with another wall or other elements: the same calibration is
-            measured on their test patients too, which the bands must not have been fitted to.
-    """
-    found = advise(run, dataset, output, config, also_test=also_test)
-    at, cover, left_out = found["adviser"], found["coverage"], found["patients_not_registered"]
-    shown = {
-        "figures": str(output / FIGURES_FILE),
-        "picture": str(output / PICTURE_FILE),
-        "level": found["calibration"].level,
-        "coverage": cover["simultaneous"],
-        "coverage_of_worst_decile_of_patients": cover["worst_decile_of_patients"],
-        "missed_share": at["missed_share"],
-        "exposures_per_minute": at["exposures_per_minute"],
-        "share_of_the_exposures_of_periodic_imaging": found["share_of_the_exposures_of_periodic_imaging"],
-        "fewer_frames_than_fluoroscopy": at["fewer_frames_than_fluoroscopy"],
-        **({"patients_not_registered": ", ".join(left_out)} if left_out else {}),
-        **{
-            other["dataset"]: (
-                f"coverage {other['coverage']['simultaneous']:.3f}, missed {other['adviser']['missed_share']:.3f}, "
-                f"{other['adviser']['exposures_per_minute']:.1f} exposures a minute"
-            )
-            for other in found["made_otherwise"]
-        },
-    }
-    return Answer(found, [shown])
