@@ -31,7 +31,7 @@ from endopilot.xray.moving_patient import seen_in_episodes, turned
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
 ONSETS = (0.05, 0.1, 0.2, 0.3, 0.5)
-"""Shares of γtip's band that are tried when an adviser is calibrated."""
+"""How likely an unseen contact may be: what is tried when an adviser is calibrated."""
 
 
 @settings
