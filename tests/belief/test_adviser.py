@@ -148,10 +148,12 @@ def advices(at: list[float], inserted: list[float], *, config: AdviserConfig, **
     return [index for index, now in enumerate(each) if index and asks(adviser, now)]
 
 
-def test_an_exposure_is_due_when_the_band_of_the_abscissa_is_as_wide_as_delta() -> None:
-    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
-    due = advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0))
-    assert due == [5, 10, 15]
+def test_an_exposure_is_due_where_the_tip_is_likely_astray() -> None:
+    """One in ten lies outside a band of 90 %, and 0.3 outside 1.036 of its 1.645 standard deviations."""
+    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.202 mm
+    config = AdviserConfig(abscissa_mm=1.0, wall_ratio=9.0)
+    for onset, due in ((0.1, [5, 10, 15]), (0.3, [8, 16])):
+        assert advices([0.3] * 20, inserted, config=config, abscissa=0.101, onset=onset) == due
 
 
 def test_an_exposure_is_due_where_the_tip_comes_to_the_wall_unseen() -> None:
@@ -185,7 +187,7 @@ def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
 def test_what_a_play_adds_widens_both_bands_at_once() -> None:
     """90 % of a normal distribution lie within 1.645 standard deviations."""
     at = predicted(radius_mm=9.0)
-    adviser = adviser_at(at, abscissa=0.0, offset=0.3)
+    adviser = adviser_at(at, abscissa=0.0, offset=0.3, onset=0.1)
     asks(adviser, at)
     known = adviser.half_width
     asks(adviser, at, 0.0)

@@ -39,7 +39,7 @@ class Calibration:
         scale: half-width of a band in units of the spread.
         longest_s: how long the intervals without X-ray were that it was calibrated on, s. Nothing is known of longer
             ones, so X-ray is due then.
-        onset: how likely the tip has to come to the wall unseen, within a period, for the adviser to ask for X-ray.
+        onset: how likely an event has to begin unseen for the adviser to ask for X-ray.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
         anatomies: patients that it was calibrated on.

@@ -123,10 +123,10 @@ MISMATCH = "model mismatch"
 class Watch:
     """Says when to switch X-ray on where a model predicts one tip, and how wide the bands around it are.
 
-    An exposure is due where the band of Δtip is as wide as δ; where the tip comes to the wall unseen more likely than
-    the calibration bears (`onset`); where the wall begins to press; after an interval as long as any that was
-    calibrated on; and every 1.5 s while the model is taken to be wrong. One shows what began within the last 0.5 s, so
-    none follows another sooner than after 1 s, and a wire that rests is not looked at twice.
+    An exposure is due where the tip is δ astray, or came to the wall unseen, more likely than the calibration bears
+    (`onset`); where the wall begins to press; after an interval as long as any that was calibrated on; and every 1.5 s
+    while the model is taken to be wrong. One shows what began within the last 0.5 s, so none follows another sooner
+    than after 1 s, and a wire that rests is not looked at twice.
 
     Bands allow for what no calibration knows, too: the lumen may be another than CT shows it, the tip another than it
     is given. A wire that is pushed while its tip rests buckles, and then snaps or folds, which no two wires do alike.
@@ -193,7 +193,7 @@ class Watch:
         half = factor * self._widths(at.spread, np.sqrt(variance_mm2 + self.sd_mm**2))
         self.half_width = np.array([half[0], np.hypot(half[1], self.wall_mm(at.radius_mm))])
         self._half = self.half_width / factor
-        self._wide = bool(half[0] >= self._config.abscissa_mm)
+        self._wide = bool(2 * ndtr(-self._config.abscissa_mm * _WITHIN / max(half[0], 1e-9)) >= self._calibration.onset)
         self._late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
         self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
         self.onset = 0.0
