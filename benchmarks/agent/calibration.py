@@ -36,8 +36,9 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, list_tasks
 
 KindName = Literal["assumed", "images", "coaxial"]
-LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
-"""Share of the intervals that the bands shall cover; periods of 0.5 s between exposures; seconds of a navigation."""
+LEVEL, ONSET, EXPOSED_EVERY, SECONDS = 0.9, 0.2, 20, 30.0
+"""Share of the intervals that the bands shall cover; how likely an unseen contact may be; periods of 0.5 s between
+exposures; seconds of a navigation."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ NO_BANDS = Calibration(
     anatomies=1,
     intervals=1,
     dataset="",
-    offset_share=1.0,
+    onset=ONSET,
     longest_s=EXPOSED_EVERY * DECISION_PERIOD_S,
 )
 
@@ -216,7 +217,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
         anatomies=len(np.unique(owner)),
         intervals=len(rows),
         dataset=f"patients to learn on of {kind.whose}",
-        offset_share=1.0,
+        onset=ONSET,
         longest_s=EXPOSED_EVERY * DECISION_PERIOD_S,
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]

@@ -226,23 +226,23 @@ def test_bands_hold_where_they_do_throughout_an_interval_without_x_ray() -> None
 
 BANDS = Calibration(
     level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
-    offset_share=1.0, longest_s=45.0,
+    onset=0.3, longest_s=45.0,
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("missed", "share"), [([0, 0, 0, 0, 0], 0.0), ([0, 1, 5, 0, 0], 0.75), ([9] * 5, 1.0)])
-def test_as_little_of_the_band_is_used_as_what_may_be_missed_allows(missed, share) -> None:
-    """No share beyond the first that misses too much is chosen; patients are alike, so that no error is added."""
-    of = dict(zip(monitoring.OFFSET_SHARES, missed, strict=True))
+@pytest.mark.parametrize(("missed", "onset"), [([0, 0, 0, 0, 0], 0.5), ([0, 1, 5, 0, 0], 0.1), ([9] * 5, 0.05)])
+def test_contacts_may_be_as_likely_as_what_may_be_missed_allows(missed, onset) -> None:
+    """None beyond the first that misses too much is chosen; patients are alike, so that no error is added."""
+    of = dict(zip(monitoring.ONSETS, missed, strict=True))
     tried = list[float]()
 
     def measured(bands: Calibration) -> list[Followed]:
-        tried.append(bands.offset_share)
-        return [followed(name, np.zeros((20, 2)), missed=of[bands.offset_share]) for name in "abc"]
+        tried.append(bands.onset)
+        return [followed(name, np.zeros((20, 2)), missed=of[bands.onset]) for name in "abc"]
 
-    least, curve = monitoring.least_offset_share(measured, BANDS, 0.25)
-    assert least == share and [each["offset_share"] for each in curve] == tried
-    assert tried == list(monitoring.OFFSET_SHARES)[: len(tried)]
+    greatest, curve = monitoring.greatest_onset(measured, BANDS, 0.25)
+    assert greatest == onset and [each["onset"] for each in curve] == tried
+    assert tried == list(monitoring.ONSETS)[: len(tried)]
 
 
 def test_the_command_calibrates_measures_and_draws(folder, tmp_path, capsys) -> None:
@@ -260,7 +260,7 @@ def test_the_command_calibrates_measures_and_draws(folder, tmp_path, capsys) -> 
     assert figures["calibration"]["anatomies"] == 2 and figures["coverage"]["patients"] == 1
     assert 0 <= figures["coverage"]["simultaneous"] <= 1 and 0 <= figures["coverage"]["samplewise"] <= 1
     assert (output / "advice.png").stat().st_size > 10_000
-    assert figures["adviser"]["offset_share"] == figures["calibration"]["offset_share"]
+    assert figures["adviser"]["onset"] == figures["calibration"]["onset"]
     same, other = figures["made_otherwise"]
     assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
     assert same["coverage"] == figures["coverage"] and same["adviser"].items() <= figures["adviser"].items()

@@ -14,9 +14,7 @@ from endopilot.belief.watch import Watch
 from endopilot.errors import InputError
 
 
-def calibration(
-    scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, offset_share: float = 1.0
-) -> Calibration:
+def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, onset: float = 0.3) -> Calibration:
     return Calibration(
         level=0.9,
         scale=scale,
@@ -25,7 +23,7 @@ def calibration(
         anatomies=10,
         intervals=40,
         dataset="key",
-        offset_share=offset_share,
+        onset=onset,
         longest_s=45.0,
     )
 
@@ -119,8 +117,8 @@ def test_what_is_missed_for_sure_is_the_share_and_its_standard_error() -> None:
 def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
         Calibration.read(tmp_path)
-    calibration(offset_share=0.25).write(tmp_path)
-    assert Calibration.read(tmp_path) == calibration(offset_share=0.25)
+    calibration(onset=0.25).write(tmp_path)
+    assert Calibration.read(tmp_path) == calibration(onset=0.25)
     (tmp_path / "xray.json").write_text('{"level": 0.9, "abscissa_terms": [], "offset_terms": []}')
     with pytest.raises(InputError, match=r"xray.json: scale: missing; .* run `endopilot advise` again"):
         Calibration.read(tmp_path)
@@ -136,11 +134,18 @@ def adviser_at(at: Predicted, config: AdviserConfig | None = None, **bands: floa
     return Watch(calibration(**bands), config or AdviserConfig(), 0.2, at, alone=False)
 
 
+def asks(adviser: Watch, at: Predicted, *more: object, moved_mm: float = 1.0, **others: float) -> bool:
+    """Return whether an exposure is due after a period in which the wire moved to and fro."""
+    adviser.move(at._replace(proximal=at.proximal + np.array([moved_mm, 0.0])))
+    adviser.move(at)
+    return adviser.advise(at, *more, **others)
+
+
 def advices(at: list[float], inserted: list[float], *, config: AdviserConfig, **bands: float) -> list[int]:
     """Return at which samples an exposure is due."""
     each = [predicted(offset, inserted_mm=mm) for offset, mm in zip(at, inserted, strict=True)]
     adviser = adviser_at(each[0], config, **bands)
-    return [index for index, now in enumerate(each) if index and adviser.advise(now)]
+    return [index for index, now in enumerate(each) if index and asks(adviser, now)]
 
 
 def test_an_exposure_is_due_when_the_band_of_the_abscissa_is_as_wide_as_delta() -> None:
@@ -149,94 +154,75 @@ def test_an_exposure_is_due_when_the_band_of_the_abscissa_is_as_wide_as_delta() 
     assert due == [5, 10, 15]
 
 
-def test_an_exposure_is_due_where_the_band_meets_the_wall() -> None:
-    offset = [0.3] * 5 + [0.56, 0.56, 0.56, 0.56, 0.61, 0.61, 0.61, 0.61, 0.71, 0.71, 0.71, 0.71] + [0.3] * 8
+def test_an_exposure_is_due_where_the_tip_comes_to_the_wall_unseen() -> None:
+    offset = [0.1] * 5 + [0.9] * 10 + [0.1] * 5 + [0.9] * 5
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0)
-    assert due == [5, 9, 13]  # the band reaches it, the tip crosses it, the band has left it behind
-    again = advices(offset * 2, [10.0] * 50, config=AdviserConfig(wall_ratio=0.6), abscissa=0.0)
-    assert again == [5, 9, 13, 30, 34, 38]  # it is armed again below
-    assert advices(offset, [10.0] * 25, config=AdviserConfig(wall_ratio=0.9), abscissa=0.0) == []
+    assert due == [5, 20]  # as it comes, and comes again; not as it rests or leaves
+    assert advices(offset, [10.0] * 25, config=AdviserConfig(wall_ratio=1.3), abscissa=0.0) == []
+    near = [0.1] * 5 + [0.55] * 20  # the band of ±0.05 mm ends at τ
+    assert advices(near, [10.0] * 25, config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, onset=0.7) == []
+    assert advices(near, [10.0] * 25, config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, onset=0.05)[0] == 5
+
+
+def test_a_contact_that_x_ray_showed_needs_no_second_look_and_one_that_it_did_not_does() -> None:
+    """γtip/(1.2 - 0.2 mm) is predicted as 0.9; τ is 0.7."""
+    at = predicted(0.9)
+    asked = []
+    for shown_mm in (0.95, 0.3):
+        adviser = adviser_at(predicted(), abscissa=0.0)
+        asks(adviser, predicted())
+        adviser.exposed(shown_mm, at)
+        asked.append([asks(adviser, at) for _ in range(6)])
+    assert not any(asked[0]) and np.flatnonzero(asked[1]).tolist() == [1]
 
 
 def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
     adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
-    due = [adviser.advise(predicted(radius_mm=r)) for r in (1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1)]
+    due = [asks(adviser, predicted(radius_mm=r)) for r in (1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1)]
     assert due == [False, False, False, True, False, False, False]
-
-
-def test_the_adviser_uses_a_share_of_the_band_across_and_all_of_that_along() -> None:
-    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
-    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), offset_share=0.5) == [5, 10, 15]
-    offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
-    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset_share=0.4)
-    assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge
-    adviser = adviser_at(predicted(radius_mm=1.0), abscissa=0.0, offset_share=0.4)
-    adviser.advise(predicted(radius_mm=1.0))
-    assert adviser.half_width[1] == 0.05
 
 
 def test_what_a_play_adds_widens_both_bands_at_once() -> None:
     """90 % of a normal distribution lie within 1.645 standard deviations."""
     at = predicted(radius_mm=9.0)
     adviser = adviser_at(at, abscissa=0.0, offset=0.3)
-    adviser.advise(at)
+    asks(adviser, at)
     known = adviser.half_width
-    adviser.advise(at, 0.0)
+    asks(adviser, at, 0.0)
     assert np.array_equal(adviser.half_width, known)
-    due = adviser.advise(at, np.array([1.5, 0.2]) ** 2)
+    due = asks(adviser, at, np.array([1.5, 0.2]) ** 2)
     np.testing.assert_allclose(adviser.half_width, [1.645 * 1.5, np.hypot(0.3, 1.645 * 0.2)], rtol=1e-3)
     assert due  # Δtip is known to no more than 2 mm
 
 
-def test_exposures_keep_their_distance() -> None:
-    offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
-    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)
-    assert np.diff(due).min() == 2
-    assert due[0] == 2
+def test_where_a_model_is_taken_to_be_wrong_each_image_tests_it() -> None:
     adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
     adviser.innovations.alarm = True
-    assert [adviser.advise(predicted()) for _ in range(6)] == [False, False, True] * 2
+    assert [asks(adviser, predicted()) for _ in range(6)] == [False, False, True] * 2
 
 
 def test_an_exposure_is_due_where_the_wall_begins_to_press() -> None:
     adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
     share = (0.5, 0.7, 0.85, 0.9, 0.7, 0.7, 0.9, 0.9, 1.1, 1.2, 1.3, 1.3, 0.7)  # of what it may press with, ±20 %
-    due = [adviser.advise(predicted(), pressed=each) for each in share]
+    due = [asks(adviser, predicted(), pressed=each) for each in share]
     assert np.flatnonzero(due).tolist() == [2, 6, 8, 10]  # either end of the band reaches the limit, and its middle
 
 
-def test_an_exposure_follows_another_as_long_as_that_showed_the_tip_on_the_other_side() -> None:
-    """γtip/(1.2 - 0.2 mm) is predicted as 0.9 and shown as 0.5 first, then as 0.8; τ is 0.7."""
-    at = predicted(0.9)
-    adviser = adviser_at(at, abscissa=0.0, offset=0.0)
-
-    def due(count: int) -> list[bool]:
-        return [adviser.advise(at) for _ in range(count)]
-
-    assert not any(due(6))  # predicted at the wall since the start
-    adviser.exposed(0.5, at)
-    assert due(6) == [False, True, False, True, False, True]
-    adviser.exposed(0.8, at)
-    assert not any(due(6))
-
-
-def test_a_model_that_erred_is_looked_at_as_long_as_its_band_lies_across_the_wall() -> None:
-    """The band of γtip is ±0.05 mm, and τ is 0.6; that of Δtip grows by 0.2 mm a sample up to 0.6 δ, or δ."""
-    inserted = [2.0 * abs(6 - i) for i in range(12)]
-    for erred, across, along in ((False, [2], [5, 10]), (True, [2, 4, 6, 8, 10], [3, 6, 9])):
-        found = []
-        for offset, moved, config in (
-            (0.58, [10.0] * 12, AdviserConfig(wall_ratio=0.6)),
-            (0.1, inserted, AdviserConfig(abscissa_mm=1.0)),
-        ):
-            adviser = adviser_at(predicted(inserted_mm=moved[0]), config, abscissa=0.1 * (offset < 0.5))
-            due = [adviser.advise(predicted(offset, inserted_mm=mm), changed=erred) for mm in moved[1:]]
-            found.append([i for i, each in enumerate(due, 1) if each])
-        assert found == [across, along]
+def test_a_wire_that_rests_is_looked_at_once() -> None:
+    """Δtip is known to 2 mm only, before an exposure and after."""
+    at = predicted()
+    for moved_mm, due in ((1.0, [1, 3, 5]), (0.01, [1])):
+        adviser, found = adviser_at(at, AdviserConfig(abscissa_mm=1.0), abscissa=0.0), []
+        adviser.move(at._replace(proximal=at.proximal + 1.0))
+        for period in range(6):
+            found += [period] * asks(adviser, at, 4.0, moved_mm=moved_mm)
+            if found[-1:] == [period]:
+                adviser.exposed(0.0, at)
+        assert found == due
 
 
 def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
     bands = replace(calibration(abscissa=0.0), longest_s=4.0)
     adviser = Watch(bands, AdviserConfig(), 0.2, predicted(), alone=False)
-    due = [adviser.advise(predicted()) for _ in range(20)]
+    due = [asks(adviser, predicted()) for _ in range(20)]
     assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s

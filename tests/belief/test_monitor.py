@@ -102,7 +102,7 @@ class Paced(Rocks):
 
     def start(self, navigation: Navigation, seed: int) -> None:
         super().start(navigation, seed)
-        self.monitor = Monitor(navigation, read_agent_calibration("assumed", 1), pace=Pace(1_000_000))
+        self.monitor = Monitor(navigation, read_agent_calibration("assumed", 1), pace=Pace(600_000))
 
 
 def test_identification_goes_on_over_decisions_and_its_belief_follows_what_came_meanwhile(along_the_fork) -> None:

@@ -158,11 +158,11 @@ def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
     """A band of Δtip that widens by 0.5 mm a second is 1 mm wide after 2 s: X-ray every fourth period."""
     calibration = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0, 0.5, 0.0, 0.0), offset_terms=(0.0, 0.0, 0.0, 0.0), anatomies=9,
-        intervals=9, dataset="", offset_share=1.0, longest_s=45.0,
+        intervals=9, dataset="", onset=0.3, longest_s=45.0,
     )  # fmt: skip
     policy = AgentPolicy(QUICK, calibration=calibration, advice=AdviserConfig(abscissa_mm=1.0, wall_ratio=2.0))
     policy.start(replace(side_branch, target=Target(branch=1, abscissa=39.0)), 0)
-    at = [k for k in range(9) if policy.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).expose]
+    at = [k for k in range(9) if policy.decide(Observation(0.5 * k, ((2.0 + k, 0.0),), None)).expose]
     assert at == [3, 7]
 
 

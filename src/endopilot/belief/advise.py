@@ -67,16 +67,16 @@ def advise(
     claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
     (fitted, left_out), (own, left_out_too) = (follow_all(part, model, config) for part in (fit, calibrating))
     bands = monitoring.calibrate(fitted, own, config.adviser.level, data.manifest["key"])
-    share, curve = monitoring.least_offset_share(
+    onset, curve = monitoring.greatest_onset(
         lambda tried: follow_all(calibrating, model, config, tried)[0], bands, config.adviser.missed
     )
-    calibration = replace(bands, offset_share=share)
+    calibration = replace(bands, onset=onset)
     found, left_out_of_test = follow_all(test, model, config, calibration)
     at = measure(found)
     content = {
         "calibration": calibration,
         "coverage": monitoring.coverage(found),
-        "adviser": {"offset_share": share} | at,
+        "adviser": {"onset": onset} | at,
         "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"]
         / max(at["periodic_exposures_per_minute_with_the_same_missed_share"], 1e-9),
         "curves": {"adviser": curve},
@@ -167,9 +167,9 @@ def _picture(content: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot()
         axes.plot([0.0, monitoring.periodic_per_minute(0.0)], [100.0, 0.0], color=GREY, label="Periodic imaging")
         curve = [(each["exposures_per_minute"], 100 * each["missed_share"]) for each in content["curves"]["adviser"]]
-        label = "Shares of γtip's band, calibration patients"
+        label = "Contacts surer or less sure, calibration patients"
         axes.plot(*zip(*curve, strict=True), color=BLUE, marker="o", markersize=3.5, label=label)
-        at, label = content["adviser"], f"New patients, {content['calibration'].offset_share:g} of γtip's band"
+        at, label = content["adviser"], f"New patients, contacts likelier than {content['calibration'].onset:g}"
         axes.plot(
             at["exposures_per_minute"], 100 * at["missed_share"], "o", color=VERMILLION, markersize=9, label=label
         )

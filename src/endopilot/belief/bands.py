@@ -39,7 +39,7 @@ class Calibration:
         scale: half-width of a band in units of the spread.
         longest_s: how long the intervals without X-ray were that it was calibrated on, s. Nothing is known of longer
             ones, so X-ray is due then.
-        offset_share: share of γtip's half-width by which the adviser asks for X-ray; of Δtip it uses the whole band.
+        onset: how likely the tip has to come to the wall unseen, within a period, for the adviser to ask for X-ray.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
         anatomies: patients that it was calibrated on.
@@ -54,7 +54,7 @@ class Calibration:
     anatomies: Annotated[int, Within(1, 10**9)]
     intervals: Annotated[int, Within(1, 10**9)]
     dataset: str
-    offset_share: NonNegative
+    onset: OpenShare
     longest_s: Seconds
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:

@@ -223,11 +223,8 @@ class Monitor:
         if self.seen is not None:
             watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
-        changed = self.identified is not None or self.moves is not None or self.belief.drives.unknown
         pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
-        due = not self.rests and watch.advise(
-            at, self.belief.play_spread() ** 2 + motion**2, changed=changed, pressed=pressed
-        )
+        due = not self.rests and watch.advise(at, self.belief.play_spread() ** 2 + motion**2, pressed=pressed)
         return self._believed(watch, at.tip, due)
 
     def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:

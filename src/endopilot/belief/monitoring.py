@@ -30,8 +30,8 @@ from endopilot.xray.moving_patient import seen_in_episodes, turned
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
-OFFSET_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-"""Shares of γtip's band that are tried when an adviser is calibrated."""
+ONSETS = (0.05, 0.1, 0.2, 0.3, 0.5)
+"""How likely an unseen contact may be: what is tried when an adviser is calibrated."""
 
 
 @settings
@@ -252,36 +252,35 @@ def calibrate(fitted: Sequence[Followed], own: Sequence[Followed], level: float,
         anatomies=len(np.unique(owner)),
         intervals=len(own),
         dataset=dataset,
-        offset_share=1.0,
+        onset=ONSETS[0],
         longest_s=SAMPLE_PERIOD_S * len(own[0].error),
     )
 
 
-def least_offset_share(
+def greatest_onset(
     measured: Callable[[Calibration], Sequence[Followed]], bands: Calibration, missed: float
 ) -> tuple[float, list[dict[str, float]]]:
-    """Return the smallest share of γtip's band by which the adviser surely misses no more than a share of the events.
+    """Return how likely an unseen contact may be before X-ray is due, for a share of the events to be surely missed.
 
-    Events of Δtip are too few to find a share for: the adviser uses the whole of that band. The shares of
-    `OFFSET_SHARES` are tried from the largest on. The last one before the first that misses too many is taken, so that
-    chance among many shares favours none; 1, where even the whole band misses too many.
+    Those of `ONSETS` are tried from the least on. The last one before the first that misses too many is taken, so that
+    chance among many favours none; the least, where it misses too many too.
 
     Args:
         measured: the calibration patients' navigations as they were followed with some bands.
 
     Returns:
-        The share, and what was measured with each that was tried.
+        The probability, and what was measured with each that was tried.
     """
-    least, curve = OFFSET_SHARES[0], list[dict[str, float]]()
-    for share in OFFSET_SHARES:
-        found = measured(replace(bands, offset_share=share))
-        curve.append({"offset_share": share} | measure(found))
+    greatest, curve = ONSETS[0], list[dict[str, float]]()
+    for onset in ONSETS:
+        found = measured(replace(bands, onset=onset))
+        curve.append({"onset": onset} | measure(found))
         names = sorted({each.patient for each in found})
         counts = np.array([counted([each for each in found if each.patient == name]) for name in names])
         if surely_missed(counts[:, 1], counts[:, 0]) > missed:
             break
-        least = share
-    return least, curve
+        greatest = onset
+    return greatest, curve
 
 
 def counted(found: Sequence[Followed], kinds: Sequence[str] = ("wall", "astray", "force")) -> Float[np.ndarray, "3"]:

@@ -8,8 +8,8 @@ widened until both agree (covariance matching).
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.special import ndtri
+from jaxtyping import Float
+from scipy.special import ndtr, ndtri
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, Predicted
@@ -107,11 +107,12 @@ _TIP_MM = np.array([0.2, 0.0])
 have the given one agree better than they are right; found with other tips, on patients to improve agents on."""
 
 
-_SPACING, _ALWAYS = 2, 3
-"""Periods from one exposure to the next, at least: one shows what began within a period before it. And where a model is
-taken to be wrong, and each image is to test it."""
-_ERRED_SHARE = 0.6
-"""Share of δ at which Δtip's band asks for X-ray once the model has erred, found on patients to improve agents on."""
+_ALWAYS = 3
+"""Periods from one exposure to the next where a model is taken to be wrong, and each image is to test it."""
+_STILL_MM = 0.1
+"""Where neither tip nor proximal end has moved by more since an exposure, mm, another shows the same."""
+_SOFT_MM = 0.03
+"""Least standard deviation of how far a tip is from τ, mm: the lumen's radius is read off a line that is smoothed."""
 _PRESSES = np.array([0.8, 1.0, 1.25])
 """Shares of the largest force that the wall may press with, by simulated wires and the drive's load, at which it is
 looked at: both ends of the band, for they err by a fifth, as wires do, and its middle."""
@@ -122,22 +123,19 @@ MISMATCH = "model mismatch"
 class Watch:
     """Says when to switch X-ray on where a model predicts one tip, and how wide the bands around it are.
 
-    Where the band of Δtip is as wide as δ, an exposure is due. Of the band of γtip the share is used that the
-    calibration found. This, over the clearance of the lumen there, lies below τ, above it, or across it. Below, nothing
-    threatens; above, the tip is known to be at the wall; across, either may be. An exposure is due where the band
-    reaches τ, where the predicted tip crosses it, and where the band has left it below; as long as the last exposure
-    showed the tip on the other side of τ than it is predicted; where the wall begins to press; and after an interval as
-    long as any that was calibrated on. It shows what began within the last 0.5 s, so none follows another sooner than
-    after 1 s.
+    An exposure is due where the band of Δtip is as wide as δ; where the tip comes to the wall unseen more likely than
+    the calibration bears (`onset`); where the wall begins to press; after an interval as long as any that was
+    calibrated on; and every 1.5 s while the model is taken to be wrong. One shows what began within the last 0.5 s, so
+    none follows another sooner than after 1 s, and a wire that rests is not looked at twice.
 
-    A model that has erred is trusted less: an exposure is due as long as the band lies across τ, and where the band of
-    Δtip is 0.6 δ wide. Bands allow for what no calibration knows, too: the lumen may be another than CT shows it, the
-    tip another than it is given. A wire that is pushed while its tip rests buckles, and then snaps or folds, which no
-    two wires do alike. In a wide lumen it lies down on the outer walls of bends before, which simulated wires predict.
+    Bands allow for what no calibration knows, too: the lumen may be another than CT shows it, the tip another than it
+    is given. A wire that is pushed while its tip rests buckles, and then snaps or folds, which no two wires do alike.
+    In a wide lumen it lies down on the outer walls of bends before, which simulated wires predict.
 
     Attributes:
         innovations: what exposures showed of the predictions.
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm.
+        onset: how likely the tip came to the wall within the last period, unseen, at that call.
         held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
     """
 
@@ -153,18 +151,18 @@ class Watch:
         self.innovations, self._alone = Innovations(), alone
         self._calibration, self._config, self._tip_radius_mm = calibration, config, tip_radius_mm
         self._inserted_mm, self._travel_mm, self._periods = float(at.proximal[0]), 0.0, 0
-        self._ends_mm, self._width_mm, self.held_mm = np.array([at.proximal[0], at.tip[0]]), 0.0, 0.0
-        self._beyond = self._is_beyond(np.full(5, at.tip[1]), at.radius_mm)
-        self._shown: bool | None = None
-        self._wide, self._late, self._presses = False, False, 0
+        self._ends_mm, self._width_mm, self.held_mm = np.array([at.proximal[0], *at.tip]), 0.0, 0.0
+        self._moved_mm, self._wide, self._late, self._presses = 0.0, False, False, 0
         self.half_width = self._half = self._widths(at.spread, np.zeros(2))
+        self._at_wall, self.onset = float(ndtr(-self._from_wall(at))), 0.0
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
         self._width_mm = max(self._width_mm, 2 * at.radius_mm)
-        now = np.array([at.proximal[0], at.tip[0]])
-        moved, tip_moved = np.abs(now - self._ends_mm).tolist()
+        now = np.array([at.proximal[0], *at.tip])
+        moved, tip_moved, across = np.abs(now - self._ends_mm).tolist()
         self._ends_mm, self.held_mm = now, self.held_mm + max(moved - tip_moved, 0.0)
+        self._moved_mm += max(moved, tip_moved, across)
 
     def compare(self, innovation: Float[np.ndarray, "2"], sd_mm: tuple[float, float]) -> None:
         """Take measured less predicted (Δtip, γtip), and the standard deviations that the measurement states, mm."""
@@ -172,15 +170,14 @@ class Watch:
 
     def exposed(self, offset_mm: float, at: Predicted) -> None:
         """Begin anew at an exposure that shows γtip, mm, with what the model then predicts."""
-        self._periods, self._travel_mm, self.held_mm = 0, 0.0, 0.0
-        self._shown = bool(self._is_beyond(np.array([offset_mm]), at.radius_mm)[0])
+        self._periods, self._travel_mm, self.held_mm, self._moved_mm = 0, 0.0, 0.0, 0.0
+        self._at_wall = float(self._ratio(offset_mm, at.radius_mm) >= self._config.wall_ratio)
 
     def advise(
         self,
         at: Predicted,
         variance_mm2: Float[np.ndarray, "2"] | float = 0.0,
         *,
-        changed: bool = False,
         pressed: float = 0.0,
     ) -> bool:
         """Return whether an exposure is due, once a period.
@@ -188,41 +185,42 @@ class Watch:
         Args:
             at: what is predicted for now, after the exposure if there was one.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
-            changed: whether the model is another than the given one, which erred.
             pressed: force of the wall as a share of what it may be.
         """
-        inserted_mm, offset_mm, factor = float(at.proximal[0]), float(at.tip[1]), self.innovations.factor
+        inserted_mm, factor = float(at.proximal[0]), self.innovations.factor
         self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
         self._inserted_mm = inserted_mm
-        erred, wall_mm = changed or bool((factor > 1).any()), self.wall_mm(at.radius_mm)
         half = factor * self._widths(at.spread, np.sqrt(variance_mm2 + self.sd_mm**2))
-        used = self._calibration.offset_share * half[1]
-        beyond = self._is_beyond(offset_mm + np.array([used, 0.0, -used, wall_mm, -wall_mm]), at.radius_mm)
-        self.half_width = np.array([half[0], np.hypot(half[1], wall_mm)])
+        self.half_width = np.array([half[0], np.hypot(half[1], self.wall_mm(at.radius_mm))])
         self._half = self.half_width / factor
-        crossed = bool((beyond & ~self._beyond).any())
-        across = bool(beyond.any() and not beyond.all())
-        disagrees = self._shown is not None and bool(beyond[1]) != self._shown
-        self._wide = bool(half[0] >= self._config.abscissa_mm * (_ERRED_SHARE if erred else 1.0))
+        self._wide = bool(half[0] >= self._config.abscissa_mm)
         self._late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
         self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
-        due = crossed or disagrees or self._wide or (across and erred) or self._late or self._presses > pressed_before
-        due = (due and self._periods >= _SPACING) or (self.innovations.alarm and self._periods >= _ALWAYS)
-        if due or not crossed:
-            self._beyond = beyond
+        self.onset = 0.0
+        if self._periods > 1:  # else X-ray shows it
+            before, self._at_wall = self._at_wall, float(ndtr(-self._from_wall(at)))
+            self.onset = self._at_wall * (1 - before)
+        due = self.onset >= self._calibration.onset or self._wide or self._late or self._presses > pressed_before
+        due = due or (self.innovations.alarm and self._periods >= _ALWAYS)
+        due = due and self._periods > 1 and self._moved_mm > _STILL_MM
         if due:
             self._periods, self._travel_mm = 0, 0.0
         return due
+
+    def _from_wall(self, at: Predicted) -> float:
+        """Return how many standard deviations the tip is from where it counts as at the wall; less than 0 beyond."""
+        missing = self._config.wall_ratio - self._ratio(float(at.tip[1]), at.radius_mm)
+        clearance_mm = max(at.radius_mm - self._tip_radius_mm, 1e-9)
+        return missing * clearance_mm / (float(self.half_width[1]) / _WITHIN + _SOFT_MM)
+
+    def _ratio(self, offset_mm: float, radius_mm: float) -> float:
+        return float(safety_ratio(np.array([offset_mm]), np.array([radius_mm]), self._tip_radius_mm)[0])
 
     def _widths(self, spread: Float[np.ndarray, "2"], beside_mm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """Return the half-widths of the bands for a spread and for standard deviations beside it, mm."""
         seconds, travel_mm = np.array([self._periods * DECISION_PERIOD_S]), np.array([self._travel_mm])
         half = self._calibration.half_width(seconds, travel_mm, spread[None])[0]
         return np.hypot(half, ndtri(0.5 + 0.5 * self._calibration.level) * beside_mm)
-
-    def _is_beyond(self, offset_mm: Float[np.ndarray, "n"], radius_mm: float) -> Bool[np.ndarray, "n"]:
-        ratio = safety_ratio(offset_mm, np.full(len(offset_mm), radius_mm), self._tip_radius_mm)
-        return ratio >= self._config.wall_ratio
 
     def wall_mm(self, radius_mm: float) -> float:
         """Return by how much the lumen's radius may be another, mm, where it is given as this, mm: a tip on the wall is

@@ -362,12 +362,8 @@ class AgentPolicy(_PlanningPolicy):
         )
 
     def wants_xray(self) -> bool:
-        """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at.
-
-        Devices that rest while a search goes on are not: they are where they were.
-        """
-        rests = self._thought is not None and self._follower.ended
-        return not rests and (bool(self._believed.asks) or self._arrived or self._shows)
+        """Ask the monitor; a device that should have arrived, and the end of a manoeuvre, are looked at."""
+        return bool(self._believed.asks) or self._arrived or self._shows
 
     def believed(self) -> BelievedTip:
         """Return where the likeliest wire has its tip, the adviser's bands around it, and why it asks for X-ray."""
