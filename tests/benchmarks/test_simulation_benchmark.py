@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from benchmarks import figures
-from benchmarks.__main__ import main
 from benchmarks.core import scenes as scenes_module
 from benchmarks.core.beside import LEAST_SHARE_MOVING, bench_motion
 from benchmarks.core.coaxial import LEAST_SHARE, bench_coaxial
@@ -29,7 +28,7 @@ from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory import Trajectory
 
 WORLDS, SAMPLES = 2, 4
-CONVERGED = SimulatorConfig(element_mm=0.35, time_step_s=0.005, tolerance_mm=1e-6)
+CONVERGED = SimulatorConfig(element_mm=0.5, time_step_s=0.01, tolerance_mm=1e-6)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,7 +42,7 @@ def patients() -> Iterator[None]:
 def made(patients: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Trajectory]]:
     """Return a small reference, and the rollouts that it holds."""
     path = tmp_path_factory.mktemp("reference") / "small.npz"
-    finer, rollouts, run = replace(CONVERGED, element_mm=0.3), [], Scene.run
+    finer, rollouts, run = replace(CONVERGED, element_mm=0.4), [], Scene.run
 
     def kept(*args: Any) -> Trajectory:
         rollouts.append(run(*args))
@@ -144,20 +143,6 @@ def test_a_reference_of_other_scenes_is_refused(small: Path, tmp_path: Path) -> 
     recipe["device"]["friction"] = 0.3
     line = refused(rewritten(small, tmp_path / "wire.npz", {"recipe": np.array(json.dumps(recipe))}))
     assert line.endswith(f"wire.npz: made for a workhorse-014 whose friction is 0.3, not 0.1; {mend}")
-
-
-def test_a_file_that_is_no_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    missing = tmp_path / "missing.npz"
-    with pytest.raises(InputError, match=r"missing\.npz: no such file; `python -m benchmarks simulation --make-ref"):
-        read_reference(missing)
-    strange = tmp_path / "strange.npz"
-    np.savez(strange, tip_position=np.zeros(3))
-    with pytest.raises(InputError, match=r"strange\.npz: no reference \("):
-        read_reference(strange)
-    with pytest.raises(SystemExit) as left:
-        main(["simulation", "--reference", str(missing)])
-    assert left.value.code == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_the_shipped_reference_is_that_of_the_scenes_of_today() -> None:

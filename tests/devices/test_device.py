@@ -152,11 +152,6 @@ def test_without_a_variable_the_folder_is_in_the_user_s_home(folders, tmp_path, 
     assert user_devices() == ("mine",)
 
 
-def test_the_same_folder_named_twice_is_one(folders, monkeypatch):
-    monkeypatch.setenv("ENDOPILOT_DEVICES", str(folders[0] / ".." / "devices"))
-    assert user_devices() == ("mine",) and read_wire("mine").diameter_mm == 0.5
-
-
 @pytest.mark.parametrize("name", ["ours", "workhorse-014"])
 def test_a_name_that_two_files_bear_is_refused(folders, name):
     (folders[0] / f"{name}.yaml").write_text(device_yaml(name)[1], encoding="utf-8")
@@ -239,11 +234,6 @@ def test_a_fault_is_told_in_one_line(tmp_path, text, message) -> None:
     path.write_text(text + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=f"robot.yaml: {message}"):
         read_robot(path)
-
-
-def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
-    with pytest.raises(InputError, match="robot 'corpath': no such robot or file; give a path, or choose from assumed"):
-        read_robot("corpath")
 
 
 def test_a_grip_weakens_a_device_and_never_strengthens_it() -> None:

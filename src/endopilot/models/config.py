@@ -92,9 +92,6 @@ class TrainConfig:
     """Seed of the initial weights, the order of the windows, and dropout."""
     processor: Processor = "auto"
     """Where to compute: "auto" takes a GPU where there is one."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the networks' products in training: "bfloat16" is mixed precision; weights, loss and what is written stay
-    float32."""
     size: TransformerConfig = field(default_factory=TransformerConfig)
     """Size of the networks; as published if not given."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,28 @@ def make_simulation(
             transmission=None if transmission is None else transmission.model(config.processor),
             worlds=worlds,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Loading:
+    """Dead loads and springs on a rod; see `Loads` in the core. Entry i belongs to node i or element i."""
+
+    force_n: Float[np.ndarray, "n 3"]
+    moment_n_mm: Float[np.ndarray, "n 3"]
+    spring_n_mm: Float[np.ndarray, "n 3"]
+    anchor_mm: Float[np.ndarray, "n 3"]
+    hold_n_mm: Float[np.ndarray, "n"]
+    attitude: Float[np.ndarray, "n 4"]
+
+    @classmethod
+    def none(cls, nodes: int) -> Loading:
+        """Return no loads on a rod of `nodes` nodes."""
+        zero, attitude = np.zeros((nodes, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1))
+        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros(nodes), attitude)
+
+    def core(self) -> _core.Loads:
+        """Return the loads as the core wants them."""
+        return _core.make_loads(**{name.partition("_")[0]: value for name, value in vars(self).items()})
 
 
 def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.ndarray]:

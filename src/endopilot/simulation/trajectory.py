@@ -58,15 +58,9 @@ class Trajectory(SolvedOutputs):
     Attributes:
         set_up: what the worlds were simulated with.
         period_s: time between samples, s.
-        start: Δ (mm) and φ (rad) of each device before the first period, as they truly were.
-        command: what the drives were asked for: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
         tip: Δtip, γtip, branch and lumen radius at each sample.
-        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
-            3 the wire went through the wall.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded; NaN beyond the
             nodes of a shorter wire.
-        vessel_to_laboratory: where a vessel that moves lies: affine maps of its points, as CT shows them, to the
-            laboratory, LPS mm; None where it lies still.
         columns: further signals by name, such as those of a robot, a policy or a plan; `SIGNALS` describes them.
         about: what else is to be known, as plain JSON values.
     """
