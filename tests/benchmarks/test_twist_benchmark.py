@@ -9,17 +9,14 @@ import pytest
 
 from benchmarks.robot.twist import (
     Run,
-    at_commands,
     bench_twist,
     dead_bands,
     passages,
     rotation_runs,
     steps_to,
-    tip_in_run,
 )
 from endopilot.anatomy.io import write_anatomy
 from endopilot.errors import InputError
-from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import EpisodeReplay
 from endopilot.types import Anatomy
 
@@ -58,24 +55,6 @@ def test_dead_bands_of_tips_that_rest_then_creep_and_leap() -> None:
     moves, snaps, per_step = dead_bands(runs)
     assert (moves[0], moves[2]) == (1, 3) and (snaps[0], snaps[2]) == (1, 4)
     assert per_step == pytest.approx(3 / 10)
-
-
-def test_tips_between_commands_as_long_as_they_are_seen() -> None:
-    commanded, nothing = np.array([True, False, True, True, False, True]), np.full((6, 3), np.nan)
-    log = RobotLog(
-        name="made up",
-        time_s=np.array([0.0, 0.04, 0.1, 0.2, 0.24, 0.3]),
-        episode=np.zeros(6, dtype=int),
-        command=np.where(commanded[:, None, None], np.zeros((6, 1, 2)), np.nan),
-        encoders=np.full((6, 1, 2), np.nan),
-        load=np.full((6, 1, 2), np.nan),
-        tip=nothing,
-        pixel=nothing[:, :2],
-        used=commanded,
-    )
-    found = at_commands(log, np.array([0.04, 0.24]), np.array([[1.0, 0, 0], [2.0, 0, 0]]))
-    assert np.array_equal(found[:, 0], [1, np.nan, 2, np.nan], equal_nan=True)
-    assert len(tip_in_run(Run(0, 3, reverses=False, advanced_mm=0.0), found)) == 1
 
 
 def test_a_fork_is_passed_once_and_the_branch_compared(fork: Anatomy) -> None:

@@ -24,7 +24,7 @@ OSTIUM_MM = 0.3
 
 def navigations(vessel, folder, **settings) -> Episodes:
     device = settings.pop("device", read_wire("workhorse-014"))
-    config = DatasetConfig(seconds=20.0, simulator=PRESETS["fast"], **settings)
+    config = DatasetConfig(seconds=20.0, seen_test_share=0.0, simulator=PRESETS["fast"], **settings)
     generate_dataset([vessel], output=folder, device=device, config=config)
     return Episodes.of_dataset(read_dataset(folder))
 

@@ -141,6 +141,15 @@ def test_damaged_checkpoints_are_named(short_run, tmp_path):
         load_model(tmp_path / "run")
 
 
+def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(short_run, toy_dataset, tmp_path):
+    train(toy_dataset, output=tmp_path / "run", config=TrainConfig(**SHORT, network="ff", precision="bfloat16"))
+    ours, theirs = (read_tensors(run / "ff.safetensors")[0] for run in (tmp_path / "run", short_run))
+    assert {weights.dtype for weights in ours.values()} == {torch.float32}
+    assert any(not torch.equal(ours[name], theirs[name]) for name in theirs)
+    curves = [read_json(run / "training.json")["ff"]["curve"] for run in (tmp_path / "run", short_run)]
+    np.testing.assert_allclose(*([entry["loss"] for entry in curve] for curve in curves), rtol=0.03)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there_is_refused(toy_dataset, tmp_path):
     with pytest.raises(InputError, match="torch finds no GPU here"):

@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.errors import InputError
-from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
+from endopilot.navigation.baseline_policies import LEAD_MM, CatheterAlone
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
@@ -76,27 +76,12 @@ def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> 
     assert loop.record().faults == 2
 
 
-def test_the_turns_depend_on_the_encoders_alone(over_the_wire) -> None:
-    policy = InTurn()
-    policy.start(replace(over_the_wire, arrives="wire"), 0)
-
-    def who(wire: float, catheter: float) -> str:
-        decision = policy.decide(Observation(0.0, ((wire, 0.0), (catheter, 0.0)), None))
-        return next((who for who, (v, _) in zip(("wire", "catheter"), decision.devices, strict=False) if v > 0), "none")
-
-    assert who(5.0, 0.0) == "wire" and who(36.0, 0.0) == "wire"
-    assert who(5.0 + LEAD_MM, 5.0) == "catheter"
-    assert who(36.0, 20.0) == "catheter"  # it goes on to behind the wire's tip
-    assert who(36.0, 36.5 - BEHIND_MM) == "wire"
-    assert who(37.0, 27.5) == "none"  # 20 mm deeper than the target
+def test_a_catheter_alone_takes_the_wire_along(over_the_wire) -> None:
     alone = CatheterAlone()
     alone.start(over_the_wire, 0)
     decisions = [alone.decide(Observation(0.0, ((5.0, 0.0), (at, 0.0)), None)) for at in (0.0, 5.1, 60.0)]
-    assert [(d.devices[0][0] > 0, d.devices[1][0] > 0) for d in decisions] == [
-        (False, True),
-        (True, True),
-        (False, False),
-    ]
+    moves = [tuple(speed > 0 for speed, _ in each.devices) for each in decisions]
+    assert moves == [(False, True), (True, True), (False, False)]
 
 
 def test_what_takes_a_wire_alone_says_so(over_the_wire) -> None:

@@ -24,11 +24,7 @@ WIRES = "wires"
 
 
 def read_run(run: str | Path) -> dict[str, Any]:
-    """Return the manifest of a finished run; that of `WIRES` names no device and no patients.
-
-    Raises:
-        InputError: there is no such folder, or it is no finished run.
-    """
+    """Return the manifest of a finished run, or raise InputError; that of `WIRES` names no device and no patients."""
     if str(run) == WIRES:
         return {"config": {}, "device": None, "networks": {}, "patients": []}
     if not Path(run).is_dir():
@@ -92,6 +88,9 @@ class TrainConfig:
     """Seed of the initial weights, the order of the windows, and dropout."""
     processor: Processor = "auto"
     """Where to compute: "auto" takes a GPU where there is one."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the networks' products in training: "bfloat16" is mixed precision; weights, loss and what is written stay
+    float32."""
     size: TransformerConfig = field(default_factory=TransformerConfig)
     """Size of the networks; as published if not given."""
 

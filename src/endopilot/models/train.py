@@ -166,7 +166,9 @@ class Job:
     def step(self, network: Network, optimizer: torch.optim.Adam, targets: Tensor, rate: float) -> float:
         """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
         *window, truth = self._window(self.training, targets)
-        loss = network.loss(network(*window), truth)
+        with torch.autocast(self._device, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+            answer = network(*window)
+        loss = network.loss(answer.float(), truth)
         if math.isfinite(value := loss.item()):
             optimizer.zero_grad()
             loss.backward()

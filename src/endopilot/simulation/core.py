@@ -175,8 +175,18 @@ def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.nda
 
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
-    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
-    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": _base_orientation(insertion)}
+    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z of the wire's
+    axes at φ = 0: the third along it, the second against its bend. Where φ's zero is that of the world's axes, it is
+    the shortest turn that takes the third axis to the direction."""
+    direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
+    if isinstance(zero, np.ndarray):
+        axes = np.column_stack([np.cross(direction, zero), -zero, direction])
+        orientation = Rotation.from_matrix(axes).as_quat(canonical=True, scalar_first=True)
+    else:
+        quaternion = np.array([1 + direction[2], -direction[1], direction[0], 0.0])
+        norm = np.linalg.norm(quaternion)
+        orientation = quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
+    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": orientation}
 
 
 def core_options(
@@ -223,16 +233,3 @@ def make_lumen(
         finer=finer,
         spheres=np.zeros((0, 8)) if spheres is None else np.ascontiguousarray(spheres, dtype=float),
     )
-
-
-def _base_orientation(insertion: Insertion) -> Float[np.ndarray, "4"]:
-    """Return the quaternion (w x y z) of a wire's axes at φ = 0: the third along it, the second against its bend. Where
-    φ's zero is that of the world's axes, it is the shortest turn that takes the third axis to the direction."""
-    direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
-    if isinstance(zero, np.ndarray):
-        axes = np.column_stack([np.cross(direction, zero), -zero, direction])
-        return Rotation.from_matrix(axes).as_quat(canonical=True, scalar_first=True)
-    axis = np.array([-direction[1], direction[0], 0.0])
-    quaternion = np.array([1 + direction[2], *axis])
-    norm = np.linalg.norm(quaternion)
-    return quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])

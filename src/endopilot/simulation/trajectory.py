@@ -155,7 +155,9 @@ class Trajectory(SolvedOutputs):
             elif path.suffix == ".csv":
                 trajectory_table(self).to_csv(partial, index=False)
             else:
-                arrays = _arrays(self)
+                # what follows from others is left out, and further signals are marked as such
+                found = {name: each for name, each in trajectory_signals(self).items() if name != "control"}
+                arrays = {f"column.{name}" if name in self.columns else name: each for name, each in found.items()}
                 with partial.open("wb") as stream:
                     np.savez_compressed(stream, about=np.array(_about(self, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -257,13 +259,6 @@ def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | 
     own = {name: values for name, values in arrays.items() if name in names}
     columns = {name.removeprefix("column."): values for name, values in arrays.items() if name.startswith("column.")}
     return Trajectory(set_up=set_up, period_s=about["period_s"], tip=tip, columns=columns, about=about["about"], **own)
-
-
-def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the arrays of a file: what follows from others is left out, and further signals are marked as such."""
-    found = trajectory_signals(trajectory)
-    del found["control"]
-    return {f"column.{name}" if name in trajectory.columns else name: each for name, each in found.items()}
 
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
