@@ -277,7 +277,10 @@ class NavigateVectorEnv(VectorEnv):
         return observations, *judged, infos
 
     def _now(self, step: Step | None = None) -> Measured:
-        return Measured.of(self._simulator, self._reality.encoders, self._episodes.routes, step)
+        simulator, tip = self._simulator, self._simulator.project()
+        force = simulator.contacts.max(axis=1) if step is None else step.contact_force_max
+        distance_mm = self._episodes.routes.distance(tip)
+        return Measured(step or simulator, force, tip, distance_mm, self._reality.encoders)
 
     def _expose(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         if self._c_arms is not None:
