@@ -12,7 +12,7 @@ import pytest
 HERE = Path(__file__).parent
 SOURCES = Path(__file__).parents[2] / "src" / "core"
 SEEN_BY_ADDRESS = (
-    "-fno-sanitize=null,alignment,object-size,vptr"  # or a fault: these checks take a quarter of the build
+    "-fno-sanitize=null,alignment,object-size,vptr"  # or a fault; a quarter of the build
 )
 SANITIZERS = ("-fsanitize=address,undefined", SEEN_BY_ADDRESS, "-fno-sanitize-recover=all")
 WARNINGS = ("-Wall", "-Wextra", "-Wno-psabi")
