@@ -11,9 +11,7 @@ import pytest
 
 HERE = Path(__file__).parent
 SOURCES = Path(__file__).parents[2] / "src" / "core"
-SEEN_BY_ADDRESS = (
-    "-fno-sanitize=null,alignment,object-size,vptr"  # or a fault; a quarter of the build
-)
+SEEN_BY_ADDRESS = "-fno-sanitize=null,alignment,object-size,vptr"  # or a fault; a quarter of the build
 SANITIZERS = ("-fsanitize=address,undefined", SEEN_BY_ADDRESS, "-fno-sanitize-recover=all")
 WARNINGS = ("-Wall", "-Wextra", "-Wno-psabi")
 FLAGS = ("-std=gnu++20", "-O1", "-g1", "-march=native", "-ffp-contract=off", *WARNINGS, *SANITIZERS)
