@@ -116,11 +116,11 @@ def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
 
 def test_walls_that_vary_otherwise_are_not_shared(bend):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
-    graded = replace(soft, wall_along=(0.25, 4.0))
-    alone, beside = Simulator(bend, WIRE, config=graded), Simulator(bend, WIRE, config=soft)
-    for each in (alone, beside):
+    # as stiff where they are stiffest: the maps alone differ
+    one, other = (Simulator(bend, WIRE, config=replace(soft, wall_along=each)) for each in ((0.25, 4.0), (4.0, 0.25)))
+    for each in (one, other):
         each.reset(inserted_length=[40.0], rotation=[0.0])
-    assert np.abs(beside.position - alone.position).max() > 5e-3
+    assert np.abs(other.position - one.position).max() > 1e-3
 
 
 def test_a_factor_is_linear_between_its_places(bend):
