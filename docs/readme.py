@@ -85,7 +85,7 @@ def _demo_table(metrics: dict, record: dict) -> str:
         "| --- " * 9 + "|",
     ]
     for row in tip_rows(metrics, SPLIT):
-        lines.append("| " + " | ".join([row.title, *(cell.text for cell in row.cells[:8])]) + " |")
+        lines.append("| " + " | ".join([row.title, *row.cells[:8]]) + " |")
     return "\n".join(
         [
             *lines,

@@ -272,14 +272,6 @@ def _gap(known: float | None, new: float | None) -> dict[str, float | None]:
     return {"difference": new - known, "ratio": new / known if known else None}
 
 
-BASELINE_WORDS: Mapping[str, str] = {
-    "hold_slack": "holding slack and offset",
-    "training_mean": "the training mean",
-    "hold_control": "holding the last control",
-    "follow_slack": "driving by the held slack",
-}
-
-
 def findings(metrics: Mapping[str, Any]) -> list[str]:
     """Return in words, from the numbers alone, where the networks beat their baselines and where they lose."""
     sentences = []
@@ -313,4 +305,4 @@ def _verdict(skills: Mapping[str, float | None], symbol: str) -> str:
         return ""
     hardest = min(known, key=lambda name: known[name])
     verdict = "beats every baseline" if known[hardest] > 0 else "loses to a baseline"
-    return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {BASELINE_WORDS[hardest]})"
+    return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {SERIES_TITLES[hardest].lower()})"

@@ -342,7 +342,6 @@ def _report(run: _Run, anatomies: Sequence[Path]) -> None:
         command=run.command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=run.model,
         replay=replay,
         replay_anatomy=anatomy,
         navigation=run.navigation,

@@ -10,8 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Shaped
-from matplotlib.axes import Axes
+from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
@@ -71,15 +70,8 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
                     ax.plot(time, values(line, "median"), **style)
                     ax.plot(time, values(line, "p95"), color=style["color"], lw=0.8, ls="-")
                 ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
-                ax.annotate(
-                    wall,
-                    (0.995, 1.0),
-                    xycoords=("axes fraction", "data"),
-                    ha="right",
-                    va="bottom",
-                    size=8.5,
-                    bbox=plate,
-                )
+                at = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+                ax.annotate(wall, (0.995, 1.0), size=8.5, bbox=plate, **at)
                 ax.set(xlabel="Time after the given states, s", ylabel=f"Safety ratio {label}", xlim=(0, None))
                 ax.set_ylim(0, float(np.clip(_upper(of_ratio, "p95"), 1.25, 1.5)))
                 ax.set_title(titles[split])
@@ -90,42 +82,30 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the control RMSE of each sequence (`tables.control_error_table`), a row a split, a series
-    above another, medians as ticks, with numbers; what lies beyond the second-widest series' 98 % quantile is in the
-    last bar."""
+    """Draw the control RMSE of the sequences (`tables.control_error_table`), a row a split, a box a series: median,
+    quartiles, and whiskers from the 5 % to the 95 % quantile."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
     splits, series = distinct(table, "split"), distinct(table, "series")
+    names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
         for row, split in enumerate(splits):
-            part = rows(table, split=split)
-            most = max(len(rows(part, series=name)) for name in series)
-            bins = int(np.clip(3 * np.sqrt(most), 8, 25))
             for ax, (column, label) in zip(axes[row], panels, strict=True):
-                of_series = [values(rows(part, series=name), column) for name in series]
-                upper = sorted(float(np.nanquantile(v, 0.98)) for v in of_series if np.isfinite(v).any()) or [1.0]
-                edges = np.linspace(0.0, 1.05 * upper[max(len(upper) - 2, 0)] + 1e-9, bins + 1)
-                for level, (name, each) in enumerate(zip(series, of_series, strict=True)):
-                    _histogram(ax, each[np.isfinite(each)], edges, -float(level), _style(name)["color"])
-                names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
-                ax.set_yticks([0.3 - level for level in range(len(series))], names if ax is axes[row, 0] else [])
-                ax.set(xlabel=label, xlim=(0, edges[-1]), ylim=(0.75 - len(series), 1.05))
-                ax.tick_params(axis="y", length=0)
-                ax.grid(False, axis="y")
-                ax.set_title(titles[split])
+                of_series = [values(rows(table, split=split, series=name), column) for name in series]
+                drawn = ax.boxplot(
+                    [each[np.isfinite(each)] for each in of_series],
+                    orientation="horizontal",
+                    whis=(5, 95),
+                    showfliers=False,
+                    patch_artist=True,
+                    tick_labels=names if ax is axes[row, 0] else [""] * len(series),
+                    medianprops={"color": BLACK},
+                )
+                for box, name in zip(drawn["boxes"], series, strict=True):
+                    box.set_facecolor(_style(name)["color"])
+                ax.set(xlabel=label, xlim=(0, None), title=titles[split])
+                ax.invert_yaxis()
     return figure
-
-
-def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
-    if not len(of):
-        return
-    counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
-    top = int(counts.argmax())
-    ax.stairs(0.75 * counts / counts.max() + bottom, edges, baseline=bottom, fill=True, color=color)
-    left = top + 1 > len(counts) / 2  # of the bar, so that the words stay in the picture
-    place, side = (edges[top] if left else edges[top + 1], bottom + 0.73), "right" if left else "left"
-    ax.annotate(f" {counts.max()} of {len(of)} ", place, ha=side, va="top", fontsize=7.5)
-    ax.plot([min(float(np.median(of)), edges[-1])] * 2, [bottom, bottom - 0.12], color=BLACK)
 
 
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy) -> Figure:

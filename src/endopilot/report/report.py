@@ -26,7 +26,6 @@ from endopilot.evaluation.results import (
 )
 from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
-from endopilot.models.config import WIRES
 from endopilot.plotting import png
 from endopilot.report import figures, report_text, tables
 from endopilot.report.scene import navigation_scene, scene_html, visible_devices
@@ -54,8 +53,8 @@ class ReportContent:
 
     Attributes:
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        evaluation: folder made by `endopilot evaluate`; `run` of `endopilot train`; `navigation` of `endopilot
-            navigate`, beside or below the report.
+        evaluation: folder made by `endopilot evaluate`; `navigation` of `endopilot navigate`, beside or below the
+            report.
         replay: navigations with `shape`, in `replay_anatomy`, the first of which is shown in space.
         manifest: how everything was made (`files.manifest`).
     """
@@ -65,7 +64,6 @@ class ReportContent:
     command: str
     patients: tuple[PatientContent, ...] = ()
     evaluation: Path | None = None
-    run: Path | None = None
     replay: Trajectory | None = None
     replay_anatomy: Path | None = None
     navigation: Path | None = None
@@ -81,6 +79,7 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
     remarks: list[str] = []
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
     context = {
+        "title": content.title,
         "content": content,
         "metrics": metrics,
         "text": report_text,
@@ -88,7 +87,6 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
         "driven": _driven(content.navigation, output_html.parent),
         "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
         "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
-        "budget": _budget(content.run),
         "manifest": json_text(content.manifest) if content.manifest else "",
         "remarks": remarks,
     }
@@ -173,12 +171,6 @@ def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
     return image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
 
 
-def _budget(run: Path | None) -> str:
-    if run is None or str(run) == WIRES:
-        return ""  # simulated wires are not trained
-    return report_text.training_budget(read_json(run / "training.json"))
-
-
 def image(png: bytes, description: str) -> Markup:
     """Return a PNG as an HTML element that needs no file."""
     data = base64.b64encode(png).decode("ascii")
@@ -218,7 +210,6 @@ def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
         origin=f"The run {run}, on the dataset {dataset}.",
         command=" ".join(command),
         evaluation=folder,
-        run=Path(run),
         manifest=record,
     )
     page = folder / REPORT_FILE

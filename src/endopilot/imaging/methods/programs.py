@@ -124,8 +124,7 @@ def segment_by_program(
         except InputError as error:
             raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
     inside = _labelled(found, label, program)
-    size = volume.voxels.shape[::-1]
-    if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume, size) > volume.spacing_mm.min() / 2:
+    if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume) > volume.spacing_mm.min() / 2:
         inside = mask_like(LumenMask(replace(found, voxels=inside)), volume)
         if not inside.any():
             raise InputError(f"{program} wrote a mask that lies outside the CT; {mend}")
