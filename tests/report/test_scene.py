@@ -115,19 +115,6 @@ def test_of_a_wire_in_its_catheter_the_tip_is_left(anatomy, pair, devices):
     assert np.array(catheter.z)[0] == -30.0 and len(catheter.z) > 20
 
 
-def test_samples_after_a_failure_are_not_shown(anatomy, rollout):
-    valid = rollout.valid.copy()
-    valid[0, 4:] = False
-    figure = navigation_scene(anatomy, dataclasses.replace(rollout, valid=valid))
-    assert [frame.name for frame in figure.frames] == ["0", "1", "2", "3"]
-
-
-def test_axes_are_equal_and_in_mm(anatomy):
-    scene = navigation_scene(anatomy).layout.scene
-    assert scene.aspectmode == "data"
-    assert all(axis.title.text.endswith("mm") for axis in (scene.xaxis, scene.yaxis, scene.zaxis))
-
-
 def test_sections_are_lines_of_their_own_and_joined(anatomy):
     lines = {trace.name: trace for trace in navigation_scene(anatomy).data}
     first, second = lines["Section 1"], lines["Section 2"]

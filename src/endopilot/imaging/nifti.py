@@ -140,7 +140,7 @@ def _placed(voxels: np.ndarray, header: Any, path: Path) -> Volume:
     differ = (
         "the other form is no rigid placement"
         if other is None
-        else f"sform and qform place voxels {apart:.3g} mm apart"
+        else f"sform and qform place voxels up to {apart:.3g} mm apart"
     )
     which = f"{differ}, and {said} do not tell which of them is the scanner's (1); set the other code to 0"
     require(one_is_scanner, path, which)
