@@ -99,8 +99,8 @@ def test_killed_and_resumed_gives_the_same_bits(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "whole").rglob("*")}
     make_toy_dataset(tmp_path / "whole", **settings)  # finished, it is left alone
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "whole").rglob("*")} == before
-    with pytest.raises(InputError, match=r"no valid episode in split 'test' \(it has seen_test, train\)"):
-        read_dataset(tmp_path / "whole").of_split("test")
+    with pytest.raises(InputError, match=r"no valid episode in split 'calibrate' \(it has seen_test, test, train\)"):
+        read_dataset(tmp_path / "whole").of_split("calibrate")
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,7 @@ def test_a_lost_or_cut_file_is_made_again(tmp_path, name, left):
     assert data_hashes(tmp_path / "d") == before and file.read_bytes() == content
 
 
-@pytest.mark.parametrize("cut", [None, 50])
-@pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
+@pytest.mark.parametrize(("name", "cut"), [("info.json", None), ("stats.json", 50), ("tasks.parquet", 50)])
 def test_a_lost_or_cut_description_is_made_again(tmp_path, name, cut):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     before = (tmp_path / "d/meta" / name).read_bytes()
@@ -246,9 +245,6 @@ def test_loader_names_what_is_damaged(tmp_path):
     older = manifest["settings"] | {"version": "endopilot 0.0.9, format 1"}
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {"settings": older}))
     with pytest.raises(InputError, match=r"made by endopilot 0\.0\.9, format 1, which .* cannot read"):
-        read_dataset(tmp_path / "d")
-    (tmp_path / "d/meta/manifest.json").write_text(json.dumps({"key": "0"}))
-    with pytest.raises(InputError, match=r"manifest\.json: settings: missing; make the dataset again"):
         read_dataset(tmp_path / "d")
     for name, odd in (("settings", None), ("anatomies", "x"), ("files", []), ("key", 3), ("samples_per_episode", None)):
         (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {name: odd}))

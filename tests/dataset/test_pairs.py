@@ -19,7 +19,6 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.models.episodes import Episodes, check_wire
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.signals import Outputs
 from endopilot.simulation.simulate import simulate
@@ -137,17 +136,6 @@ def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
     assert tip.abscissa.max() > 60
     assert driven.command[:, :, 1, 0].min() < 0  # pushed into a dead end, it is pulled back
     np.testing.assert_array_equal(driven.command[:, :, 0, 0], 0.0)
-
-
-def test_models_take_it_with_the_commands_of_both_devices(pairs):
-    data = read_dataset(pairs)
-    arrays = {each.name: getattr(data, each.name) for each in fields(data)}
-    longer = {name: np.repeat(a, 2, axis=1) for name, a in arrays.items() if np.shape(a)[1:2] == (20,)}
-    episodes = Episodes.of_dataset(replace(data, **longer))
-    np.testing.assert_array_equal(episodes.command, np.repeat(data.command, 2, axis=1))
-    np.testing.assert_array_equal(episodes.start, data.initial)
-    assert episodes.device == Stack(WIRE, (WEAK,))
-    check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 
 def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path):

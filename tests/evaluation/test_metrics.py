@@ -18,7 +18,7 @@ from endopilot.evaluation.results import (
     summarize,
     write_results,
 )
-from endopilot.report import tables
+from endopilot.report import figures
 
 NAN = np.nan
 
@@ -144,18 +144,18 @@ def test_the_generalisation_gap_is_new_patients_error_against_known_ones(results
 
 
 def test_tip_error_table_holds_the_mean_over_sequences(results):
-    table = tables.rows(tables.tip_error_table(results), split="test", series="P4")
+    table = figures.rows(figures.tip_error_table(results), split="test", series="P4")
     expected = np.abs(results["test"].error("P4", "abscissa")).mean(axis=0)
-    np.testing.assert_allclose(tables.values(table, "abscissa_mae_mm"), expected)
-    np.testing.assert_allclose(tables.values(table, "time_s")[[0, -1]], [0.5, 45.0])
+    np.testing.assert_allclose(figures.values(table, "abscissa_mae_mm"), expected)
+    np.testing.assert_allclose(figures.values(table, "time_s")[[0, -1]], [0.5, 45.0])
 
 
 def test_a_wire_that_fills_the_lumen_is_at_the_wall_and_a_lost_tip_is_nowhere(results):
     true = results["test"].true
     filled = replace(true, radius=np.full_like(true.radius, 0.1), offset=true.offset.copy())
     filled.offset[:, 7] = np.nan
-    table = tables.safety_table({"test": replace(results["test"], true=filled)})
-    clearance = tables.rows(tables.rows(table, split="test", series="true"), ratio="clearance")
+    table = figures.safety_table({"test": replace(results["test"], true=filled)})
+    clearance = figures.rows(figures.rows(table, split="test", series="true"), ratio="clearance")
     for name in ("median", "p95"):
-        values = tables.values(clearance, name)
+        values = figures.values(clearance, name)
         assert np.isnan(values[7]) and (np.delete(values, 7) == 1.0).all()

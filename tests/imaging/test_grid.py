@@ -8,8 +8,8 @@ import pytest
 from scipy import ndimage
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
-from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.overlay_picture import draw_overlay
+from endopilot.imaging.vessel_tracking import lumen_at_half_height
 from endopilot.imaging.voxels import dilated
 from endopilot.types import LumenMask, Volume
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from endopilot.errors import InputError
 from endopilot.evaluation.results import METRICS_FILE, RESULTS_FILE
 from endopilot.imaging.overlay_picture import draw_slices
-from endopilot.report import figures, tables
+from endopilot.report import figures
 from endopilot.report.report import report_evaluation
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -73,37 +73,37 @@ def test_the_tree_shows_every_section_in_its_colour(anatomy):
 
 
 def test_series_are_drawn_with_their_values(results):
-    table = tables.tip_error_table(results)
+    table = figures.tip_error_table(results)
     ax = figures.tip_error_figure(table, TITLES).axes[0]
     line = next(line for line in ax.get_lines() if "P1" in str(line.get_label()))
-    expected = tables.values(tables.rows(table, split="seen_test", series="P1"), "abscissa_mae_mm")
+    expected = figures.values(figures.rows(table, split="seen_test", series="P1"), "abscissa_mae_mm")
     np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), expected)
     assert ax.get_xlabel().endswith(", s")
     assert ax.get_ylabel().endswith(", mm")
 
 
 def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
-    table = tables.safety_table(results)
+    table = figures.safety_table(results)
     axes = figures.safety_figure(table, TITLES).axes
     for ax, ratio in ((axes[1], "clearance"), (axes[3], "radius")):
         lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()]
         for series in ("true", "P3", "P4"):
-            part = tables.rows(table, split="test", series=series, ratio=ratio)
+            part = figures.rows(table, split="test", series=series, ratio=ratio)
             for column in ("median", "p95"):
-                expected = tables.values(part, column)
+                expected = figures.values(part, column)
                 assert any(len(line) == len(expected) and np.allclose(line, expected) for line in lines)
         assert any(np.allclose(line, 1.0) for line in lines)  # the wall
     assert axes[3].get_ylabel().endswith("γ / r")
 
 
 def test_the_boxes_of_control_errors_are_those_of_the_series(results):
-    table = tables.control_error_table(results)
+    table = figures.control_error_table(results)
     figure = figures.control_error_figure(table, TITLES)
-    series = tables.distinct(table, "series")
+    series = figures.distinct(table, "series")
     assert len(series) >= 4 and len(figure.axes) == 4
     medians = [line.get_xdata()[0] for line in figure.axes[2].lines if line.get_color() == figures.BLACK]
     shown = [
-        np.median(tables.values(tables.rows(table, split="test", series=name), "translation_rmse_mm_s"))
+        np.median(figures.values(figures.rows(table, split="test", series=name), "translation_rmse_mm_s"))
         for name in series
     ]
     np.testing.assert_allclose(medians[: len(shown)], shown)

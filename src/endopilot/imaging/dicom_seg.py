@@ -112,6 +112,6 @@ def read_seg(path: Path, label: int | str | None = None) -> Volume:
 
 
 def _shares(content: Any, number: int) -> Any:
-    """Return by how much a segment fills each voxel, on the grid of all segments, and that grid: i, j and k, the last of
-    highdicom's axes first, are right-handed."""
+    """Return by how much a segment fills each voxel, on the grid of all segments: i, j and k, the last of highdicom's
+    axes first, are right-handed."""
     return content.get_volume(segment_numbers=[number]).ensure_handedness("LEFT_HANDED", flip_axis=0)

@@ -1,9 +1,9 @@
-"""The figures of an evaluation and of a report: each function returns one; `titles` says what a reader calls each
-split."""
+"""The figures of an evaluation and of a report, and the tables of what they draw, which are written beside them as CSV;
+`titles` says what a reader calls each split."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
@@ -13,10 +13,11 @@ import pandas as pd
 from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
-from endopilot.evaluation.results import SERIES_TITLES
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time
+from endopilot.evaluation.results import CONTROL_BASELINES, SERIES_TITLES, TIP_BASELINES, SplitResult
 from endopilot.imaging.overlay_picture import draw_slices
 from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
-from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
 
 SERIES_STYLE: dict[str, dict] = {
@@ -33,8 +34,72 @@ SERIES_STYLE: dict[str, dict] = {
 }
 
 
+SAFETY_SERIES = ("true", "P3", "P4")
+
+
+def tip_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return the mean |error| of Δtip and γtip over the sequences, mm, for each split, series and time."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered(result.tips, [name for key, names in TIP_BASELINES.items() for name in (key, *names)]):
+            means = {
+                f"{coordinate}_mae_mm": mean_over_time(result.error(series, coordinate))
+                for coordinate in ("abscissa", "offset")
+            }
+            pieces.append(pd.DataFrame({"split": split, "series": series, "time_s": result.time_s, **means}))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def safety_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return quantiles over the sequences of γ/r ("radius") and γ/(r − r_w) ("clearance") against time."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered({"true": None, **result.tips}, SAFETY_SERIES):
+            tip = result.true if series == "true" else result.tips[series]
+            for ratio, wire_radius in (("radius", 0.0), ("clearance", result.wire_radius_mm)):
+                values = quantiles_over_time(safety_ratio(tip.offset, tip.radius, wire_radius))
+                keys = {"split": split, "series": series, "ratio": ratio, "time_s": result.time_s}
+                pieces.append(pd.DataFrame({**keys, **values}))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return the RMSE of each sequence's controls, in mm/s and deg/s, for each split and series."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered(result.controls, ("P2", *CONTROL_BASELINES)):
+            rmse = control_rmse(result.controls[series], result.true_control)
+            columns = {"translation_rmse_mm_s": rmse[:, 0], "rotation_rmse_deg_s": rmse[:, 1]}
+            anatomy = [result.anatomies[index] for index in result.anatomy]
+            keys = {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
+            pieces.append(pd.DataFrame(keys | columns))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def rows(table: pd.DataFrame, **equal: str) -> pd.DataFrame:
+    """Return the rows in which each named column has the given value."""
+    chosen = np.ones(len(table), dtype=bool)
+    for column, value in equal.items():
+        chosen &= np.asarray(table[column]) == value
+    return pd.DataFrame(table[chosen])
+
+
+def values(table: pd.DataFrame, column: str) -> np.ndarray:
+    """Return a column of numbers."""
+    return np.asarray(table[column], dtype=float)
+
+
+def distinct(table: pd.DataFrame, column: str) -> list[str]:
+    """Return the different values of a column in the order of their appearance."""
+    return [str(value) for value in dict.fromkeys(table[column])]
+
+
+def _ordered(available: Mapping[str, Any], order: Sequence[str]) -> list[str]:
+    return [name for name in dict.fromkeys(order) if name in available]
+
+
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw the mean |error| of Δtip and γtip against time, one row a split (`tables.tip_error_table`)."""
+    """Draw the mean |error| of Δtip and γtip against time, one row a split (`tip_error_table`)."""
     splits = distinct(table, "split")
     panels = (("abscissa_mae_mm", "Mean |error| of Δtip, mm"), ("offset_mae_mm", "Mean |error| of γtip, mm"))
     with matplotlib.rc_context(STYLE):
@@ -82,7 +147,7 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw the control RMSE of the sequences (`tables.control_error_table`), a row a split, a box a series: median,
+    """Draw the control RMSE of the sequences (`control_error_table`), a row a split, a box a series: median,
     quartiles, and whiskers from the 5 % to the 95 % quantile."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
     splits, series = distinct(table, "split"), distinct(table, "series")

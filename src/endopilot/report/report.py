@@ -27,7 +27,7 @@ from endopilot.evaluation.results import (
 from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
 from endopilot.plotting import png
-from endopilot.report import figures, report_text, tables
+from endopilot.report import figures, report_text
 from endopilot.report.scene import navigation_scene, scene_html, visible_devices
 from endopilot.report.still import render_still
 from endopilot.simulation.trajectory import Trajectory
@@ -188,9 +188,9 @@ def report_evaluation(folder: Path) -> Path:
 
 def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str], folder: Path) -> None:
     drawn = {
-        "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
-        "safety_ratio": (tables.safety_table(results), figures.safety_figure),
-        "control_error": (tables.control_error_table(results), figures.control_error_figure),
+        "tip_error": (figures.tip_error_table(results), figures.tip_error_figure),
+        "safety_ratio": (figures.safety_table(results), figures.safety_figure),
+        "control_error": (figures.control_error_table(results), figures.control_error_figure),
     }
     for name, (table, draw) in drawn.items():
         with writing(folder / f"{name}.csv") as partial:
