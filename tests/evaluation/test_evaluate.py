@@ -13,17 +13,15 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
-from endopilot.devices.drive_limits import SPARE_MM
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-from endopilot.evaluation.protocols import Recorded, count_steps, run_protocols
+from endopilot.evaluation.protocols import Recorded
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.episodes import OpenLoop
 from endopilot.report.report import report_evaluation
-from toy_navigation import LENGTH_MM, make_toy_dataset, toy_run
+from toy_navigation import make_toy_dataset, toy_run
 
 
 def test_both_splits_are_evaluated_on_navigations_that_were_not_trained_on(evaluated, toy_dataset):
@@ -56,34 +54,6 @@ def test_an_untrained_forward_network_is_the_baseline_it_corrects(evaluated):
     np.testing.assert_allclose(result.controls["P2"], result.controls["follow_slack"], atol=1e-3)
     assert np.abs(result.error("true_replay", "abscissa")).max() < 1e-3
     assert result.tip_distance["true_replay"].max() < 1e-3
-
-
-class Parroting:
-    """Predicts that the tip is where it is; a patient at a time."""
-
-    def __init__(self):
-        self.patients = []
-
-    def rollout_forward(self, episodes):
-        self.patients.append(set(episodes.anatomy.tolist()))
-        later = slice(WINDOW, None)
-        return OpenLoop(episodes.tip[:, later], episodes.proximal[:, later], episodes.control[:, later])
-
-    rollout_inverse = rollout_dual = rollout_forward
-
-
-def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_dataset):
-    data = read_dataset(toy_dataset)
-    data = data[np.random.default_rng(0).permutation(len(data))]
-    remarks, predictor = [], Parroting()
-    with patch("endopilot.dataset.loader.run_set_up", toy_run):
-        result = run_protocols(predictor, data, None, lambda amount=1, remark="": remarks.append(remark))
-    np.testing.assert_array_equal(result.tips["P1"].abscissa, result.true.abscissa)
-    assert len(remarks) == count_steps(data)
-    patients = len(set(data.anatomy.tolist()))
-    assert patients > 1 and all(len(names) == 1 for names in predictor.patients[: 3 * patients])
-    assert remarks[0] == "forward; P1: Δtip errs by 0.000 mm in 1 patient"
-    assert remarks[patients - 1].endswith(f"in {patients} patients")
 
 
 def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
@@ -208,21 +178,6 @@ def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, ca
     with pytest.raises(SystemExit, match="0"):
         main(["evaluate", "r", "-o", "out", "--json"])
     assert json.loads(capsys.readouterr().out)["splits"].keys() == metrics["splits"].keys()
-
-
-def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated, toy_dataset):
-    # The toy wire in closed form: Δtip = Δ − slack, with the slack of a play operator over the whole history.
-    result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
-    data = read_dataset(toy_dataset)
-    name, sequence = result.anatomies[result.anatomy[0]], result.sequence[0]
-    episode = data[np.flatnonzero((data.anatomy == name) & (data.sequence == sequence))]
-    held = np.repeat(episode.control[:, 29:30, 0], 90, axis=1)
-    inserted = episode.inserted_length[:, 29] + 0.5 * np.cumsum(held[..., 0], axis=1)
-    inserted = np.minimum(np.maximum(inserted, 0.0), LENGTH_MM + SPARE_MM)
-    slack = inserted - result.tips["hold_control"].abscissa[:1]
-    curliness = 0.02 + 0.005 * (len(name) % 3)
-    assert (slack >= curliness * inserted - 1e-3).all()
-    assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
 
 
 def test_controls_pass_the_drives_of_a_robot(toy_dataset):

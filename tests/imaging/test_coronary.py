@@ -89,7 +89,12 @@ def test_the_left_tree_is_another_one(heart):
 def test_an_artery_beside_a_chamber_is_not_taken_for_a_part_of_it():
     """A Gaussian of 1 mm closes the fat between them, and another vessel, 36 mm away, is taken for the right artery."""
     patient = make_patient(AtlasConfig(vessel="rca", seed=0, population="textbook"), 0)
-    ct = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
+    whole = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
+    index = whole.world_to_index(patient.tree.line.points)
+    low = np.maximum(index.min(axis=0) - 40, 0).astype(int)
+    high = index.max(axis=0).astype(int) + 40
+    box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+    ct = replace(whole, voxels=whole.voxels[box], origin_mm=whole.index_to_world(low.astype(float)))
     found = segment(ct, config=SegmentConfig(method="coronary", vessel="rca"))
     assert np.linalg.norm(found.ostium.position - patient.insertion.position) < 0.5
 

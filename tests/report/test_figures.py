@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -55,15 +54,6 @@ def test_the_ct_is_shown_as_radiologists_read_it_however_it_is_stored(direction)
     assert (rows.min(), rows.max()) == (0, 8)  # +z upwards from the lowest row
     assert columns.mean() == pytest.approx(10.0)
     assert coronal.images[0].origin == "lower"
-
-
-def test_the_axial_slice_goes_through_the_ostium():
-    volume, mask = make_volume(np.eye(3))
-    marked = volume.voxels.copy()
-    marked[6, 12, 14] = 999
-    axial = Figure().subplots()
-    draw_slices([axial], replace(volume, voxels=marked), [(mask, "red")], through=mask.ostium.position)
-    assert np.asarray(axial.images[0].get_array())[12, 14] == 999
 
 
 def test_the_tree_shows_every_section_in_its_colour(anatomy):
