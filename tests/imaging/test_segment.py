@@ -226,11 +226,11 @@ def test_another_task_and_device_are_passed_on_and_the_first_seed_is_the_ostium(
 def test_nnunet_is_run_with_all_folds_in_the_model_s_own_format(program, ct, tmp_path):
     program("nnUNetv2_predict_from_modelfolder", _NNUNET)
     model = f"model={_model(tmp_path / 'model')}"
-    with pytest.raises(InputError, match=r"marked 2 labels \(1, 2\); choose one"):
+    with pytest.raises(InputError, match=r"not taken: the mask holds 2 labels \(1, 2\); choose one"):
         segment(ct, config=SegmentConfig(method="nnunet", options=(model,)))
     mask = segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=2")))
     np.testing.assert_array_equal(mask.volume.voxels, ct.voxels > 300)
-    with pytest.raises(InputError, match="no voxel with label 3"):
+    with pytest.raises(InputError, match="no voxel has label 3"):
         segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=3")))
 
 
@@ -248,10 +248,10 @@ def test_nnunet_without_a_model_is_refused(ct):
             "exit code 1: ERROR: no licence; install",
         ),
         ("print('done')", r"wrote no coronary_arteries.nii.gz \(it wrote nothing\)"),
-        (_TOTALSEGMENTATOR.format(device="gpu", above=3000), "found no lumen in this CT"),
+        (_TOTALSEGMENTATOR.format(device="gpu", above=3000), "not taken: the mask is empty"),
         (
             "import sys; open(sys.argv[4] + '/coronary_arteries.nii.gz', 'w').write('x')",
-            "is no volume; install",
+            r"is not taken: .*, or install",
         ),
     ],
     ids=["missing", "fails", "writes nothing", "finds nothing", "writes rubbish"],

@@ -120,23 +120,6 @@ def score_columns(patients: list[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(name for patient in patients for name in patient["scores"]))
 
 
-SCORE_TITLES: Mapping[str, str] = {
-    "dice": "Dice",
-    "cldice": "clDice",
-    "overlap": "centerline overlap",
-    "inside_accuracy_mm": "centerline error, mm",
-    "radius_mae_mm": "radius error, mm",
-    "ostium_error_mm": "ostium error, mm",
-    "false_length_mm": "false branches, mm",
-}
-"""Headings of the anatomy's scores; others are shown by their names."""
-
-
-def score_title(name: str) -> str:
-    """Return a score's heading."""
-    return SCORE_TITLES.get(name, name.replace("_", " "))
-
-
 def _mm(series: Mapping[str, Any], coordinate: str) -> str:
     mae = series[coordinate]["all"]["mae"]
     return "–" if mae is None else f"{mae:.2f} mm"
