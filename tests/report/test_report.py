@@ -4,7 +4,6 @@ import dataclasses
 import html
 import re
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from endopilot.imaging.volume import write_mask, write_volume
 from endopilot.report import report
 from endopilot.report.report import PatientContent, ReportContent, write_report
 from endopilot.report.report_text import tip_rows
-from endopilot.report.still import LIBRARIES_MISSING
 from endopilot.types import LumenMask, Volume
 
 
@@ -67,11 +65,6 @@ def make_content(folder, rollout) -> ReportContent:
     )
 
 
-@pytest.fixture
-def no_still(monkeypatch):
-    monkeypatch.setattr(report, "render_still", lambda *_: LIBRARIES_MISSING)
-
-
 def write_page(tmp_path, content) -> Page:
     write_report(tmp_path / "report.html", content)
     return Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -79,8 +72,7 @@ def write_page(tmp_path, content) -> Page:
 
 @pytest.fixture(scope="module")
 def page(material, rollout, tmp_path_factory) -> Page:
-    with patch.object(report, "render_still", lambda *_: LIBRARIES_MISSING):
-        return write_page(tmp_path_factory.mktemp("page"), make_content(material, rollout))
+    return write_page(tmp_path_factory.mktemp("page"), make_content(material, rollout))
 
 
 def test_every_section_is_there(page):
@@ -122,27 +114,21 @@ def test_words_of_the_page(page, words):
     assert words in page.words
 
 
-def test_a_missing_graphics_library_is_named_and_the_report_goes_on(material, rollout, tmp_path, no_still):
-    remarks = write_report(tmp_path / "report.html", make_content(material, rollout))
-    assert remarks == [LIBRARIES_MISSING]
-    assert "apt-get install libegl1" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
-def test_sections_with_nothing_to_show_are_left_out(material, tmp_path, no_still):
+def test_sections_with_nothing_to_show_are_left_out(material, tmp_path):
     patient = PatientContent(name="mesh", anatomy=material / "anatomy")
     page = write_page(tmp_path, ReportContent(title="T", origin="O", command="C", patients=(patient,)))
     assert page.sections == ["result", "patients", "navigation-in-space", "repeat"]
     assert "Nothing was evaluated" in page.words
 
 
-def test_one_known_patient_alone_is_reported(material, results, tmp_path, no_still):
+def test_one_known_patient_alone_is_reported(material, results, tmp_path):
     write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, {"c"}, 0))
     content = ReportContent(title="T", origin="O", command="C", evaluation=tmp_path / "e")
     page = write_page(tmp_path, content)
     assert "Of new navigations, known patients; the first 15 s" in page.words
 
 
-def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path, no_still):
+def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path):
     content = dataclasses.replace(make_content(material, rollout), evaluation=tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"metrics\.json"):
         write_report(tmp_path / "report.html", content)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
@@ -28,11 +27,8 @@ from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
 from endopilot.plotting import png
 from endopilot.report import figures, report_text
-from endopilot.report.scene import navigation_scene, scene_html, visible_devices
-from endopilot.report.still import render_still
+from endopilot.report.scene import navigation_scene, scene_html
 from endopilot.simulation.trajectory import Trajectory
-
-STILL_FILE = "scene.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,12 +67,10 @@ class ReportContent:
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write_report(output_html: Path, content: ReportContent) -> list[str]:
-    """Write the report as one HTML file, and the still picture `scene.png` beside it; return remarks, such as which
-    library a left-out picture needs. Raises InputError for a missing or damaged file, or a report that cannot be
+def write_report(output_html: Path, content: ReportContent) -> None:
+    """Write the report as one HTML file. Raises InputError for a missing or damaged file, or a report that cannot be
     written."""
     output_html = Path(output_html)
-    remarks: list[str] = []
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
     context = {
         "title": content.title,
@@ -85,15 +79,13 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
         "text": report_text,
         "patients": [_patient(patient) for patient in content.patients],
         "driven": _driven(content.navigation, output_html.parent),
-        "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
+        "scene": _scene(content),
         "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
         "manifest": json_text(content.manifest) if content.manifest else "",
-        "remarks": remarks,
     }
     page = render("report.html.j2", **context)
     with writing(output_html) as partial:
         partial.write_text(page, encoding="utf-8")
-    return remarks
 
 
 def render(template: str, **content: Any) -> str:
@@ -136,7 +128,7 @@ def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
     }
 
 
-def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str, Any] | None:
+def _scene(content: ReportContent) -> dict[str, Any] | None:
     folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
     if folder is None:
         return None
@@ -145,23 +137,11 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     if replay is not None:
         seconds = replay.valid.shape[1] * replay.period_s
         caption = f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
-    problem = render_still(anatomy, _farthest(replay), still)
-    if problem is not None:
-        remarks.append(problem)
     return {
         "html": scene_html(figure),
         "plotly": Markup(get_plotlyjs()),
-        "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
         "caption": caption,
     }
-
-
-def _farthest(replay: Trajectory | None) -> list[np.ndarray]:
-    """Return the first world's wire where its tip is deepest in the vessel; nothing without a replay."""
-    if replay is None or replay.shape is None or not replay.valid[0].any():
-        return []
-    depth = np.where(replay.valid[0], replay.tip.abscissa[0, :, 0], -np.inf)
-    return visible_devices(replay, 0, int(np.argmax(depth)))
 
 
 def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
