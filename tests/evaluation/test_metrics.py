@@ -126,7 +126,7 @@ def test_findings_say_where_a_baseline_wins(results):
     found = {sentence.split(":")[0]: sentence for sentence in findings(metrics)}
     assert "Δtip beats every baseline" in found["New patients, P1"]
     assert "Δtip loses to a baseline" in found["New patients, P4"]
-    assert "driving by the held slack" in found["New patients, P4"]
+    assert "against baseline: drive by the held slack" in found["New patients, P4"]
 
 
 @pytest.fixture
