@@ -144,20 +144,12 @@ def test_figures_are_those_of_the_samples(folder):
         for quantile, share in (("p5", 5), ("median", 50), ("p95", 95)):
             assert figures[name][quantile] == pytest.approx(np.percentile(values[valid], share), abs=2e-5), name
     assert figures["branches visited"] == {"1": 1.0}
+    velocity = data.control[valid][:, 0]
+    assert figures["manoeuvres"]["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)
+    assert min(figures["manoeuvres"].values()) > 0
+    assert sum(figures["manoeuvres"].values()) == pytest.approx(1, abs=3e-4)
     assert figures["invalid"] == 6  # the second navigation of each of six files
     assert figures["invalid_reasons"] == {"did not converge": 6}
-
-
-def test_manoeuvres_are_those_that_were_driven(folder):
-    data = read_dataset(folder)
-    velocity = data.control[data.valid][:, 0]
-    shares = describe_dataset(folder).figures["manoeuvres"]
-    assert shares["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)
-    assert shares["retraction"] == pytest.approx((velocity[:, 0] < -0.1).mean(), abs=1e-4)
-    still = np.abs(velocity[:, 0]) <= 0.1
-    assert shares["pause"] == pytest.approx((still & (np.abs(velocity[:, 1]) <= 0.02)).mean(), abs=1e-4)
-    assert min(shares.values()) > 0
-    assert sum(shares.values()) == pytest.approx(1, abs=3e-4)
 
 
 def test_every_distribution_has_a_picture(folder, tmp_path):
