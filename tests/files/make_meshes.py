@@ -17,7 +17,7 @@ def arc() -> np.ndarray:
     return np.column_stack([10 + 30 * np.sin(2 * along), -5 + 20 * along**2, 5 + 60 * along])
 
 
-def tube(axis: np.ndarray, radius: float = 2.0, sides: int = 12) -> tuple[np.ndarray, np.ndarray]:
+def tube(axis: np.ndarray, radius: float | np.ndarray = 2.0, sides: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an open tube around an axis."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])

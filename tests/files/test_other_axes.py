@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +12,11 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
-from endopilot.imaging.volume import read_mask
 from endopilot.types import LumenMask
 from endopilot.vessels.coronary_inlet import coronary_inlet
 from endopilot.vessels.surface import Surface, surface_from_mask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries
 
-REAL = Path(__file__).parents[3] / "shared/data/real_coronaries"
 RAS = np.array([-1.0, -1.0, 1.0])
 
 
@@ -28,54 +25,26 @@ def both():
     return mask_of_arteries(artery("rca"), artery("lca"))
 
 
-@pytest.fixture(scope="module", params=["rca", "lca"])
-def alone(request):
-    wall = surface_from_mask(mask_of_arteries(artery(request.param)).volume)
-    return request.param, Surface(wall.vertices * RAS, wall.faces)
-
-
-def test_a_single_artery_in_ras_axes_is_never_taken_for_the_other_one(alone):
-    vessel, wall = alone
+def test_a_single_artery_in_ras_axes_is_never_taken_for_the_other_one():
+    wall = surface_from_mask(mask_of_arteries(artery("lca")).volume)
+    turned = Surface(wall.vertices * RAS, wall.faces)
     for asked in ("rca", "lca"):
         with pytest.raises(InputError, match="give --coordinates ras") as refused:
-            coronary_inlet(wall, asked, "tree", "lps")
+            coronary_inlet(turned, asked, "tree", "lps")
         assert "--vessel" not in str(refused.value)
-    found = coronary_inlet(Surface(wall.vertices * RAS, wall.faces), vessel, "tree", "ras")
-    assert np.linalg.norm(found.position - PLACE_MM[vessel]) < 4.0
-
-
-def test_arteries_that_are_in_lps_though_ras_was_given_are_told(both):
-    wall = surface_from_mask(both.volume)
+    assert np.linalg.norm(coronary_inlet(wall, "lca", "tree", "ras").position - PLACE_MM["lca"]) < 4.0
     with pytest.raises(InputError, match="leave --coordinates ras out"):
-        coronary_inlet(Surface(wall.vertices * RAS, wall.faces), "lca", "tree", "ras")
+        coronary_inlet(turned, "lca", "tree", "ras")
 
 
 @pytest.mark.parametrize(
-    ("turned", "exchanged"),
-    [((1, 2), "left and right, front and back"), ((2,), "left and right"), ((1,), "front and back")],
-    ids=["ras", "mirrored across", "mirrored in depth"],
+    ("turned", "exchanged"), [((1, 2), "left and right, front and back"), ((1,), "front and back")]
 )
 def test_a_mask_in_other_axes_names_those_that_are_exchanged(both, turned, exchanged):
     voxels = np.flip(both.volume.voxels, axis=turned).copy()
-    for vessel in ("rca", "lca"):
-        with pytest.raises(InputError, match=f"with {exchanged} exchanged, .* mend the orientation") as refused:
-            coronary_inlet(LumenMask(replace(both.volume, voxels=voxels)), vessel, "mask")
-        assert "--vessel" not in str(refused.value)
-
-
-@pytest.mark.skipif(not REAL.exists(), reason="the real coronary arteries are not here")
-def test_a_left_artery_that_may_be_a_right_one_in_other_axes_has_a_note():
-    mask = read_mask(REAL / "0491.nii.gz", label=1)
-    assert coronary_inlet(mask, "rca", "mask").notes == ()
-    turned = LumenMask(replace(mask.volume, voxels=np.flip(mask.volume.voxels, axis=(1, 2)).copy()))
-    (note,) = coronary_inlet(turned, "lca", "mask").notes
-    assert "left and right, front and back exchanged, this would be a right coronary artery" in note
-
-
-def place_advised(message):
-    found = re.search(r"--ostium-mm (-?\d+\.\d) (-?\d+\.\d) (-?\d+\.\d)", message)
-    assert found is not None
-    return tuple(float(value) for value in found.groups())
+    with pytest.raises(InputError, match=f"with {exchanged} exchanged, .* mend the orientation") as refused:
+        coronary_inlet(LumenMask(replace(both.volume, voxels=voxels)), "rca", "mask")
+    assert "--vessel" not in str(refused.value)
 
 
 def touching():
@@ -105,11 +74,10 @@ def test_the_other_vessel_is_advised_only_where_it_is_then_found(held, asked):
 
 def test_arteries_that_touch_are_told_as_that_and_the_place_advised_is_an_ostium():
     mask = touching()
-    for vessel in ("rca", "lca"):
-        with pytest.raises(InputError, match="one lumen seems to hold both coronary arteries") as refused:
-            coronary_inlet(mask, vessel, "mask")
-        assert "--vessel" not in str(refused.value)
-        place = place_advised(str(refused.value))
-        assert np.linalg.norm(place - PLACE_MM[vessel]) < 5.0
+    with pytest.raises(InputError, match="one lumen seems to hold both coronary arteries") as refused:
+        coronary_inlet(mask, "lca", "mask")
+    assert "--vessel" not in str(refused.value)
+    advised = re.search(r"or --ostium-mm (-?\d+\.\d) (-?\d+\.\d) (-?\d+\.\d)", str(refused.value))
+    place = tuple(float(value) for value in advised.groups())
     anatomy = extract_anatomy(mask, name="mask", config=AnatomyConfig(vessel="lca", ostium_mm=place))
     assert np.linalg.norm(anatomy.insertion.position - PLACE_MM["lca"]) < 4.0

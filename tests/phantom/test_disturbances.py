@@ -10,7 +10,6 @@ from scipy.ndimage import map_coordinates, maximum_filter
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.phantom import chest, metal
-from endopilot.phantom.painter import Grid
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.phantom.scanner import scan
 
@@ -68,11 +67,6 @@ def test_grain_is_coarser_at_equal_standard_deviation():
         assert found == pytest.approx(np.exp(-2 * np.log(2) * (0.8 / width) ** 2), abs=0.03)
 
 
-def test_grain_leaves_edges_as_sharp(anatomy, quiet):
-    coarse = make_phantom(anatomy, config=replace(QUIET, grain_mm=1.0), seed=2)
-    np.testing.assert_array_equal(coarse.voxels, quiet.voxels)
-
-
 def test_calcium_blooms_over_the_lumen(anatomy):
     ill = replace(QUIET, calcium=6.0)
     plain, bloomed = (make_phantom(anatomy, config=replace(ill, blooming_mm=b), seed=7).voxels for b in (0.0, 0.8))
@@ -110,20 +104,6 @@ def test_a_lead_runs_through_the_right_heart_and_draws_streaks(anatomy, quiet):
     assert np.count_nonzero(signed < -100) > 200
 
 
-def test_back_projection_reconstructs_a_disc():
-    # Line integrals of a disc of 1000 HU and radius 12 mm at (7, -5): 2 sqrt(r² - s²).
-    axis = np.arange(-40.0, 40.1, 1.0)
-    angles = np.arange(metal._VIEWS) * np.pi / metal._VIEWS
-    bins = np.arange(-60, 61) * metal._BIN_MM
-    centre = 7.0 * np.cos(angles) - 5.0 * np.sin(angles)
-    chord = 2 * np.sqrt(np.maximum(12.0**2 - (bins - centre[:, None]) ** 2, 0.0))
-    hu = metal._back_projected(1000.0 * metal._WATER * chord, angles, Grid(axis, axis, axis), np.zeros(2))
-    y, x = np.meshgrid(axis, axis, indexing="ij")
-    distance = np.hypot(x - 7.0, y + 5.0)
-    assert np.mean(hu[distance < 10]) == pytest.approx(1000.0, rel=0.03)
-    assert abs(np.mean(hu[(distance > 14) & (distance < 30)])) < 20.0
-
-
 def test_bright_veins_touch_the_artery(anatomy, quiet):
     bright = make_phantom(anatomy, config=replace(QUIET, veins=0.9), seed=2)
     change = bright.voxels.astype(int) - quiet.voxels
@@ -138,8 +118,12 @@ def test_bright_veins_touch_the_artery(anatomy, quiet):
         assert (apart.min(axis=1) - beside.radius).min() == pytest.approx(least + 0.2, abs=0.9)
 
 
-def test_a_larger_appendage_comes_to_the_left_artery():
-    left = make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
+@pytest.fixture(scope="module")
+def left():
+    return make_patient(AtlasConfig(vessel="lca", seed=1000), 1)
+
+
+def test_a_larger_appendage_comes_to_the_left_artery(left):
     usual, larger = (make_phantom(left, config=replace(QUIET, appendage_mm=a), seed=0) for a in (0.0, 5.0))
     more = (larger.voxels.astype(int) - usual.voxels) > 150
     assert np.count_nonzero(more) * usual.spacing_mm.prod() > 1500.0
@@ -148,15 +132,13 @@ def test_a_larger_appendage_comes_to_the_left_artery():
     assert not more[tuple(index)].any()
 
 
-@pytest.mark.parametrize("vessel", ["rca", "lca"])
-def test_a_graft_joins_the_aorta_to_the_artery(vessel):
-    patient = make_patient(AtlasConfig(vessel=vessel, seed=1000), 1)
-    volume = make_phantom(patient, config=replace(QUIET, graft=True), seed=0)
-    graft = chest.bypass_graft(chest.place(patient.tree), patient.tree)
+def test_a_graft_joins_the_aorta_to_the_artery(left):
+    volume = make_phantom(left, config=replace(QUIET, graft=True), seed=0)
+    graft = chest.bypass_graft(chest.place(left.tree), left.tree)
     assert np.quantile(at(volume, graft.points[5:-5]), 0.1) > 330
-    path = chest.main_paths(patient.tree)[0]
+    path = chest.main_paths(left.tree)[0]
     assert np.linalg.norm(path.points - graft.points[-1], axis=1).min() < 0.1
-    assert graft.points[0, 2] > patient.insertion.position[2] + 12.0
+    assert graft.points[0, 2] > left.insertion.position[2] + 12.0
     middle = graft.points[len(graft.points) // 2]
     assert np.linalg.norm(path.points - middle, axis=1).min() > 8.0
 
@@ -164,6 +146,5 @@ def test_a_graft_joins_the_aorta_to_the_artery(vessel):
 def test_what_disturbs_leaves_the_scanner_and_the_noise_as_they_are(anatomy):
     noisy = replace(QUIET, noise_hu=(20.0, 40.0), lumen_hu=(300.0, 500.0), calcium=3.0)
     plain = make_phantom(anatomy, config=noisy, seed=4).voxels.astype(int)
-    for disturbed in ({"stents": 1}, {"veins": 0.8}):  # a graft widens the field of view
-        change = make_phantom(anatomy, config=replace(noisy, **disturbed), seed=4).voxels - plain
-        assert np.mean(change == 0) > 0.9 and np.abs(change).max() > 100
+    change = make_phantom(anatomy, config=replace(noisy, stents=1, veins=0.8), seed=4).voxels - plain
+    assert np.mean(change == 0) > 0.9 and np.abs(change).max() > 100
