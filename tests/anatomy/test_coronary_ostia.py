@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from analytic_shapes import mask_of
 
-from benchmarks.anatomy.analytic_lumens import tree_of
-from endopilot.anatomy.distance import distance_map_from_spheres
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree
@@ -93,18 +91,6 @@ def test_a_cone_narrows_from_its_wide_end_and_widens_from_the_narrow_one():
     np.testing.assert_allclose([wide.heading[2], narrow.heading[2]], [1.0, -1.0], atol=0.01)
 
 
-def test_a_fork_entered_from_the_side_opens_backwards():
-    along, side = np.linspace(0.0, 10.0, 21)[:, None], np.array([np.sin(0.7), 0.0, np.cos(0.7)])
-    up, fork = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 10.0])
-    tree = tree_of(
-        (2.0 * along * up, 1.6, -1), (2.0 * fork + 3.0 * along * up, 1.6, 0), (2 * fork + along * side, 1.2, 0)
-    )
-    lumen = distance_map_from_spheres(tree, spacing_mm=0.5)
-    ends = open_ends(skeleton_of(*grid_points(lumen, lumen.values > 0), lumen.spacing_mm))
-    tip = min(ends, key=lambda end: np.linalg.norm(end.position - 2 * fork - 10.0 * side))
-    assert tip.opening_deg > 140.0
-
-
 def test_the_likeliest_pair_of_ends_wins_over_each_ends_own_score(both):
     """The end that alone looks best as a left main does not win against one at the right place."""
     lumens = [artery("rca"), artery("lca")]
@@ -115,17 +101,6 @@ def test_the_likeliest_pair_of_ends_wins_over_each_ends_own_score(both):
     assert end_score(away, "lca") > end_score(true, "lca")
     assert np.linalg.norm(ranking.candidates[0].position - true.position) < 0.1
     assert ranking.absent + sum(candidate.probability for candidate in ranking.candidates) <= 1.0 + 1e-9
-
-
-def test_no_vessel_lies_in_the_aorta_between_the_ostia():
-    lumens = [artery("rca"), artery("lca")]
-    ends = [open_ends(skeleton_of(*grid_points(each, each.values > 0), each.spacing_mm)) for each in lumens]
-    right, left = (
-        max(own, key=lambda end: end_score(end, side)) for own, side in zip(ends, ("rca", "lca"), strict=True)
-    )
-    across = right.position + np.linspace(0.1, 0.9, 9)[:, None] * (left.position - right.position)
-    free, crossed = (rank_ostia(ends, vessels)["lca"].candidates[0].probability for vessels in (None, across))
-    assert free > 0.99 and 1.0 - crossed > 2.0 * (1.0 - free)
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real coronary masks are not here")

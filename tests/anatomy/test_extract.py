@@ -11,11 +11,10 @@ from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from endopilot.anatomy.centerline import to_cut
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
-from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
+from endopilot.types import Insertion, LumenMask, Volume
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import Polylines
 from endopilot.vessels.surface import Surface, surface_from_mask
@@ -154,20 +153,6 @@ def test_what_is_no_vessel_is_refused(voxels, message):
     with pytest.raises(InputError, match=message) as error:
         extract_anatomy(LumenMask(Volume(voxels, np.full(3, 0.5), np.zeros(3), np.eye(3))), name="bad")
     assert "\n" not in str(error.value)
-
-
-def test_a_line_is_extended_only_as_far_as_the_vessel_is_round():
-    axis = np.arange(-6.0, 6.2, 0.2)
-    height = np.arange(-10.0, 10.2, 0.2)
-    z, y, x = np.meshgrid(height, axis, axis, indexing="ij")
-    half = np.where(z < 0, 3.0, 3.0 - 0.2 * z)  # the smaller half-axis; the larger one grows
-    wall = 1.0 - np.hypot(x / np.where(z < 0, 3.0, 3.0 + 0.3 * z), y / half)
-    field = DistanceMap(3.0 * wall, 0.2, np.array([-6.0, -6.0, -10.0]))
-    points = np.stack([np.zeros(9), np.zeros(9), np.arange(-8.0, 1.0)], axis=-1)
-    line, radius = to_cut(field, points, np.full(9, 3.0), 1.0)
-    # the smaller half-axis is 0.75 · 3 mm at z = 3.75 mm
-    assert line[-1, 2] == pytest.approx(3.0, abs=0.3)
-    np.testing.assert_allclose(radius[9:], [3.0, 2.6, 2.4], atol=0.15)
 
 
 def test_mask_away_from_the_ostium_is_refused(fork_mask):

@@ -113,21 +113,15 @@ def test_a_branch_begins_on_its_parents_axis_at_the_fork():
 HALF_MM = (22.0, 12.0, 34.0)
 
 
-def upright(points, x, low, radius=1.5):
-    """A vessel along z from `low` to 30 mm at (x, 0)."""
-    z = np.clip(points[..., 2], low, 30.0)
-    return radius - np.sqrt((points[..., 0] - x) ** 2 + points[..., 1] ** 2 + (points[..., 2] - z) ** 2)
-
-
 def two_arteries(points):
-    return np.maximum(upright(points, -10.0, -20.0), upright(points, 10.0, -30.0))
+    return np.maximum(tube(points, -10.0, -20.0, 30.0), tube(points, 10.0, -30.0, 30.0))
 
 
 def artery_from_aorta(points):
     """A vessel that leaves a ball of 9 mm radius around (0, 0, 22); a bulge of 4 mm stands 20 mm below its end."""
     aorta = 9.0 - np.linalg.norm(points - [0.0, 0.0, 22.0], axis=-1)
     bulge = 4.0 - np.linalg.norm(points - [0.0, 0.0, -12.0], axis=-1)
-    return np.maximum.reduce([upright(points, 0.0, -32.0), aorta, bulge])
+    return np.maximum.reduce([tube(points, 0.0, -32.0, 30.0), aorta, bulge])
 
 
 def test_of_two_vessels_the_larger_is_taken_and_the_other_named():

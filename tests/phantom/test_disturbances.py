@@ -111,11 +111,6 @@ def test_bright_veins_touch_the_artery(anatomy, quiet):
     path = anatomy.tree.longest_path()
     gap = np.array([(np.linalg.norm(path.points - p, axis=1) - path.radius).min() for p in places])
     assert np.count_nonzero(gap < 1.5) > 30
-    heart = chest.place(anatomy.tree)
-    for touching, least in ((False, 1.5), (True, 0.5)):
-        beside = chest.cardiac_veins(heart, anatomy.tree, touching=touching)[0]
-        apart = np.linalg.norm(beside.points[:, None] - path.points, axis=2) - path.radius
-        assert (apart.min(axis=1) - beside.radius).min() == pytest.approx(least + 0.2, abs=0.9)
 
 
 @pytest.fixture(scope="module")

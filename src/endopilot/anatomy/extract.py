@@ -32,6 +32,7 @@ from endopilot.vessels.coronary_ostia import course_off_deg
 from endopilot.vessels.graph import lumen_graph
 from endopilot.vessels.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
 from endopilot.vessels.line_graph import found_lines
+from endopilot.vessels.medial_lines import traced_lines
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import (
     ANSWERED,
@@ -144,9 +145,8 @@ def extract_anatomy(
             tree, rule = _tree(surface, finest, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
-            left = coverage.unreached(lumen.before, *sampled(tree), float(voxels_mm.max()))
-            balance = coverage.record(lumen.before, widened, left)
-            left = [stretch for stretch in left if not lumen.told[stretch.nodes].all()]
+            left = coverage.unreached(lumen.lines, *sampled(tree), float(voxels_mm.max()))
+            balance = coverage.record(lumen.lines, widened, left)
             line = tree.branches[0].centerline
             notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + float(voxels_mm.max()))
         advance()
@@ -205,10 +205,8 @@ def _wall(
     surface, notes = repair_surface.closed_surface(content, given, label, config.vessel)
     step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
-    _, touches, lines, _ = parted(voxels)
-    notes += touch_remarks(touches, parted=False)
-    lumen = repair.Lumen(voxels, lines, lines, np.zeros(len(lines.points), dtype=bool), notes)
-    return surface, lumen, np.empty((0, 3)), inlet
+    notes += touch_remarks(parted(voxels)[1], parted=False)
+    return surface, repair.Lumen(voxels, traced_lines(voxels), notes), np.empty((0, 3)), inlet
 
 
 def _doubts(tree: VesselTree, vessel: str) -> list[str]:

@@ -33,29 +33,22 @@ _OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 
 @dataclass(frozen=True, eq=False)
 class Lumen:
-    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out.
-
-    `before` is the middle of all that the file connects with it, which the tree should reach; `told` those points of it
-    that lie in another vessel, parted from this one with a remark.
-    """
+    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out."""
 
     mask: Volume
     lines: MedialLines
-    before: MedialLines
-    told: Bool[np.ndarray, "_"]
     notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, with its middle `before`, and
-    `parted` where they touch, with its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
+    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, and `parted` where they touch, with
+    its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
 
     joined: Volume
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
     parted: Volume
     touches: list[Touch]
-    before: MedialLines
     lines: MedialLines
 
 
@@ -116,9 +109,7 @@ def connected_mask(
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
     lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
     lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
-    before = whole.before.within(own[tuple(whole.before.index.T)], corner)
-    told = np.isin(labels[tuple((before.index + corner).T)] - 1, severed)
-    return Lumen(lumen, lines, before, told, remarks)
+    return Lumen(lumen, lines, remarks)
 
 
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:

@@ -100,9 +100,9 @@ class _Ring:
     around_mm: float
 
 
-def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
-    """Return the mask parted where it touches itself, all its contacts and loops, and its middle before and after. No
-    part loses its way to the rest, except one of two vessels that certainly only touch."""
+def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines]:
+    """Return the mask parted where it touches itself, all its contacts and loops, and its middle then. No part loses
+    its way to the rest, except one of two vessels that certainly only touch."""
     parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
@@ -113,7 +113,7 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
             for ring in sorted(rings, key=lambda ring: -ring.around_mm):
                 every.say(False, thin.local[ring.nodes[0]], ring.around_mm)
             if len(every.found) > _MOST_RINGS:
-                return mask, every.found, before, before
+                return mask, every.found, before
         crossings = itertools.chain(_crossings(thin, rings), _crossings(lines, []))
         opened = sum([parting.crossing(each, thin, rings) for each in crossings])
         if not (opened or sum([parting.ring(each, thin) for each in rings])):
@@ -123,7 +123,7 @@ def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]
     if aside := _without_sides(result, lines):
         result, lines = aside[0], traced_lines(aside[0])
         parting.found.append(aside[1])
-    return result, parting.found, before, lines
+    return result, parting.found, lines
 
 
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
