@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from analytic_shapes import mask_of
+from scipy.ndimage import label
+from scipy.spatial import KDTree
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask
 from endopilot.vessels.coronary_inlet import coronary_inlet
@@ -23,7 +27,7 @@ from endopilot.vessels.coronary_ostia import CRUX_FROM_OSTIUM_MM, Crux, end_scor
 from endopilot.vessels.ends import open_ends, skeleton_of
 from endopilot.vessels.inlet import component, entrance, grid_points
 from endopilot.vessels.sources import Polylines
-from endopilot.vessels.surface import distance_map_from_surface, surface_from_mask
+from endopilot.vessels.surface import Surface, distance_map_from_surface, surface_from_mask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"
@@ -39,7 +43,6 @@ def right_alone():
     return mask_of_arteries(artery("rca"))
 
 
-@pytest.mark.parametrize("vessel", ["rca", None])
 def test_each_artery_is_found_in_a_mask_of_both_with_crumbs_and_in_its_surface(both):
     voxels = both.volume.voxels.copy()
     voxels[2:5, 2:5, 2:5] = True
@@ -66,6 +69,7 @@ def test_the_tree_begins_at_the_found_ostium_and_the_record_says_how_sure_it_is(
     assert any("perhaps the left coronary artery" in note for note in anatomy.provenance["notes"])
 
 
+@pytest.mark.parametrize("vessel", ["rca", None])
 def test_a_given_ostium_five_millimetres_off_enters_at_the_open_end(right_alone, vessel):
     lumen = distance_map_from_surface(surface_from_mask(right_alone.volume), spacing_mm=0.5)
     points, clearance = grid_points(lumen, component(lumen, None))
@@ -213,3 +217,63 @@ def test_lines_of_the_other_artery_are_noted(kind, asked):
     runs = [note for note in notes if "runs as a" in note]
     found = "right" if kind == "rca" else "left"
     assert bool(runs) == (kind != asked) and all(f"as a {found} coronary artery does" in note for note in runs)
+
+
+RAS = np.array([-1.0, -1.0, 1.0])
+
+
+def test_a_single_artery_in_ras_axes_is_never_taken_for_the_other_one():
+    wall = surface_from_mask(mask_of_arteries(artery("lca")).volume)
+    turned = Surface(wall.vertices * RAS, wall.faces)
+    for asked in ("rca", "lca"):
+        with pytest.raises(InputError, match="give --coordinates ras") as refused:
+            coronary_inlet(turned, asked, "tree", "lps")
+        assert "--vessel" not in str(refused.value)
+    assert np.linalg.norm(coronary_inlet(wall, "lca", "tree", "ras").position - PLACE_MM["lca"]) < 4.0
+    with pytest.raises(InputError, match="leave --coordinates ras out"):
+        coronary_inlet(turned, "lca", "tree", "ras")
+
+
+@pytest.mark.parametrize(
+    ("turned", "exchanged"), [((1, 2), "left and right, front and back"), ((1,), "front and back")]
+)
+def test_a_mask_in_other_axes_names_those_that_are_exchanged(both, turned, exchanged):
+    voxels = np.flip(both.volume.voxels, axis=turned).copy()
+    with pytest.raises(InputError, match=f"with {exchanged} exchanged, .* mend the orientation") as refused:
+        coronary_inlet(LumenMask(replace(both.volume, voxels=voxels)), "rca", "mask")
+    assert "--vessel" not in str(refused.value)
+
+
+def touching(mask):
+    """Both arteries in one piece: a bridge where they come nearest to each other beyond their first 40 mm."""
+    pieces, _ = label(mask.volume.voxels, structure=np.ones((3, 3, 3)))
+    one, two = (np.argwhere(pieces == number) for number in np.argsort(-np.bincount(pieces.ravel())[1:])[:2] + 1)
+    places = [mask.volume.index_to_world(index[:, ::-1].astype(float)) for index in (one, two)]
+    far = [np.linalg.norm(place[:, None] - list(PLACE_MM.values()), axis=-1).min(axis=1) > 40.0 for place in places]
+    gap, nearest = KDTree(places[1][far[1]]).query(places[0][far[0]])
+    start, end = one[far[0]][gap.argmin()], two[far[1]][nearest[gap.argmin()]]
+    voxels = mask.volume.voxels.copy()
+    for share in np.linspace(0.0, 1.0, 100):
+        i, j, k = np.rint(start + share * (end - start)).astype(int)
+        voxels[i - 1 : i + 2, j - 1 : j + 2, k - 1 : k + 2] = True
+    return LumenMask(replace(mask.volume, voxels=voxels))
+
+
+@pytest.mark.parametrize(("held", "asked"), [("rca", "lca"), ("lca", "rca")])
+def test_the_other_vessel_is_advised_only_where_it_is_then_found(right_alone, held, asked):
+    mask = right_alone if held == "rca" else mask_of_arteries(artery(held))
+    with pytest.raises(InputError, match=f"take --vessel {held}"):
+        coronary_inlet(mask, asked, "mask")
+    found = coronary_inlet(mask, held, "mask")
+    assert np.linalg.norm(found.position - PLACE_MM[held]) < 4.0
+
+
+def test_arteries_that_touch_are_told_as_that_and_the_place_advised_is_an_ostium(both):
+    mask = touching(both)
+    with pytest.raises(InputError, match="one lumen seems to hold both coronary arteries") as refused:
+        coronary_inlet(mask, "lca", "mask")
+    assert "--vessel" not in str(refused.value)
+    advised = re.search(r"or --ostium-mm (-?\d+\.\d) (-?\d+\.\d) (-?\d+\.\d)", str(refused.value))
+    place = tuple(float(value) for value in advised.groups())
+    anatomy = extract_anatomy(mask, name="mask", config=AnatomyConfig(vessel="lca", ostium_mm=place))
+    assert np.linalg.norm(anatomy.insertion.position - PLACE_MM["lca"]) < 4.0

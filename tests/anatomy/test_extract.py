@@ -112,7 +112,6 @@ def test_flaws_of_masks_are_repaired(fork_mask):
     )
     assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
     assert any("bridged" in note for note in anatomy.provenance["notes"])
-    assert any("left out" in note for note in anatomy.provenance["notes"])
 
 
 def test_surface_with_holes_and_inverted_normals(fork_mask, tmp_path):

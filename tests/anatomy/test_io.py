@@ -73,15 +73,28 @@ def test_identity_changes_with_everything_that_affects_a_wire(anatomy):
     assert len({anatomy.identity, *(other.identity for other in changed)}) == 1 + len(changed)
 
 
-def test_a_record_of_another_vessel_is_refused(anatomy, tmp_path):
+@pytest.mark.parametrize("file", ["centerline.vtp", "lumen.nrrd"])
+def test_a_changed_file_is_refused(anatomy, tmp_path, file):
+    write_anatomy(anatomy, output=tmp_path / "a")
+    content = (tmp_path / "a" / file).read_bytes()
+    for changed in (content[:-1], content[:100] + b"x" + content[101:]):
+        (tmp_path / "a" / file).write_bytes(changed)
+        with pytest.raises(InputError, match=rf"{file}: differs from what anatomy\.json records"):
+            read_anatomy(tmp_path / "a")
+
+
+@pytest.mark.parametrize("odd", [None, 7, -1, "x", [], {}, [1.0, 2.0, 3.0], float("nan")])
+def test_a_record_with_an_odd_entry_is_refused_in_one_line_or_means_the_same(anatomy, tmp_path, odd):
     write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "anatomy.json"
     record = json.loads(path.read_text())
-    assert record["identity"] == anatomy.identity
-    record["insertion"]["position_mm"][0] += 0.5
-    path.write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"anatomy\.json: identity is not that of the vessel in it"):
-        read_anatomy(tmp_path / "a")
+    changes = [{name: odd} for name in record] + [{"insertion": record["insertion"] | {"position_mm": odd}}]
+    for change in changes:
+        path.write_text(json.dumps(record | change))
+        try:
+            assert read_anatomy(tmp_path / "a").identity == anatomy.identity
+        except InputError as error:
+            assert str(error).startswith(str(tmp_path)) and "\n" not in str(error)
 
 
 def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):

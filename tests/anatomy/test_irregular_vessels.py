@@ -16,7 +16,6 @@ from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask
 from endopilot.types import Insertion, LumenMask, Volume
 from endopilot.vessels.surface import surface_from_mask
-from toy_coronaries import artery, mask_of_arteries
 
 VOXEL_MM = (0.6, 0.6, 0.6)
 FORK_MM = np.array([0.0, 0.0, 20.0])
@@ -76,7 +75,7 @@ def test_the_other_side_of_a_wide_inlet_is_no_branch_that_leads_back():
     tip = project_tip(anatomy.tree, anatomy.insertion, up)
     assert np.abs(tip.abscissa - (up[:, 2] + 20)).max() < 1.5  # a wire in the web lies beside the line, not far ahead
     # The radius is the vessel's and not the distance to the cut.
-    assert anatomy.tree.branches[0].centerline.radius.min() > 1.2 and anatomy.catheter_radius_mm == 0.9
+    assert anatomy.tree.branches[0].centerline.radius.min() > 1.2
 
 
 def test_a_vessel_of_one_voxel_is_refused_with_the_reason():
@@ -142,16 +141,3 @@ def test_coronary_ostium_is_where_the_vessel_leaves_the_aorta():
     assert anatomy.insertion.direction[2] < -0.9
     assert anatomy.tree.longest_path().radius[0] < 2.5
     assert anatomy.tree.longest_path().abscissa[-1] > 40.0  # on through the aneurysm, to the end
-
-
-def test_aneurysm_low_in_the_tree_is_not_taken_for_the_aorta():
-    lumen = artery("rca")
-    index = np.indices(lumen.values.shape)[::-1].reshape(3, -1).T
-    place = (lumen.origin_mm + lumen.spacing_mm * index).reshape(*lumen.values.shape, 3)
-    low = place[lumen.values > 1.0]
-    sac = 5.0 - np.linalg.norm(place - low[low[:, 2].argmin()], axis=-1)
-    mask = mask_of_arteries(replace(lumen, values=np.maximum(lumen.values, sac)))
-    anatomy = extract_anatomy(mask, name="sac", config=AnatomyConfig(vessel="rca"))
-    assert anatomy.provenance["ostium_rule"] == "shape of the coronary arteries"
-    assert np.linalg.norm(anatomy.insertion.position) < 3.0
-    assert anatomy.tree.longest_path().radius.max() > 3.5

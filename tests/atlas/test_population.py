@@ -18,7 +18,7 @@ from endopilot.atlas.branching import Vessel, lumens_collide, stenoses
 from endopilot.atlas.population import Draw, Population, population_of
 from endopilot.atlas.variation import TIGHTEST, bent, catheter_direction, ectasia
 
-COUNT = 24
+COUNT = 32
 COARSE = partial(distance_map_from_spheres, spacing_mm=3.0)
 """A wall where lines are what counts: a fine one takes most of the time."""
 REAL = {

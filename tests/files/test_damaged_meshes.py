@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from make_meshes import arc, markup, tube, write_lines, write_surface
+from make_meshes import arc, tube, write_lines, write_surface
 
 from endopilot.errors import InputError
 from endopilot.vessels.read_source import read_source
@@ -103,18 +102,3 @@ def test_edited_meshes_are_read_or_refused(originals, name, edits):
         place = int(share * len(content))
         content[place : place + {"put": len(text), "cut": 40, "add": 0}[kind]] = b"" if kind == "cut" else text
     outcome(name, bytes(content))
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=6,
-)
-KEYS = ["type", "coordinateSystem", "coordinateUnits", "controlPoints", "measurements", "label"]
-
-
-@given(changes=st.dictionaries(st.sampled_from(KEYS), VALUES, min_size=1, max_size=3))
-@settings(max_examples=100, deadline=None, derandomize=True)
-def test_edited_curves_are_read_or_refused(changes):
-    curve = markup(arc()[::6], np.full(10, 1.5)) | changes
-    outcome("cl.mrk.json", json.dumps({"markups": [curve]}).encode())
