@@ -91,7 +91,7 @@ def coronary_inlet(
     rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
     ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]
     best, other = ranking.candidates[0], counterpart.candidates[0]
-    if best.probability < CERTAIN or ranking.touching.probability > 0.5:
+    if not _is_certain(ranking):
         raise InputError(f"{label}: {_doubt(ranking, counterpart, side, coordinates)}")
     crux, paired = None, other.probability >= PRESENT and other.piece != best.piece
     if paired:
@@ -101,10 +101,14 @@ def coronary_inlet(
     return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None)
 
 
+def _is_certain(ranking: OstiumRanking) -> bool:
+    return ranking.candidates[0].probability >= CERTAIN and ranking.touching.probability <= 0.5
+
+
 def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coordinates: str | None) -> str:
     """Say what a lumen may hold instead of an artery with a sure ostium, the likeliest first, and what mends each."""
     other: Side = "lca" if side == "rca" else "rca"
-    held = counterpart.candidates[0].probability >= CERTAIN
+    held = _is_certain(counterpart)
     both = "one lumen seems to hold both coronary arteries, or arteries and veins, which touch: give each its own label"
     rows = [
         *((each.probability, f"it begins there: --ostium-mm {_option(each)}") for each in ranking.candidates[:_NAMED]),

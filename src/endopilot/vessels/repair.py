@@ -16,7 +16,7 @@ from endopilot.types import Insertion, Volume
 from endopilot.vessels.graph import split
 from endopilot.vessels.inlet import COMPARABLE, Vessel, piece_on_side
 from endopilot.vessels.medial_lines import MedialLines, piece_labels
-from endopilot.vessels.remarks import longest_first
+from endopilot.vessels.remarks import NOTED_MM, longest_first
 from endopilot.vessels.surface import filled_box
 from endopilot.vessels.topology import SMALLEST_PIECE, Touch, parted, touch_remarks
 
@@ -160,12 +160,14 @@ def pieces_left_out(
 ) -> list[str]:
     """Say which pieces (points, LPS mm, of `counted`) were left out and where they lie: a real vessel may be lost with
     them. The lumen is made of `taken`; `severed` touched it and were parted from it."""
-    lumen, found = np.concatenate([pieces[number] for number in taken]), []
-    reach = KDTree(lumen) if len(pieces) > len(taken) else None
-    for number, place in enumerate(pieces):
-        if reach is None or number in taken:
-            continue
+    lumen, reach, found = np.concatenate([pieces[number] for number in taken]), None, []
+    for number in (number for number in range(len(pieces)) if number not in taken):
+        place = pieces[number]
         extent, kind = float(np.linalg.norm(np.ptp(place, axis=0))), "a piece apart from the lumen"
+        if extent < NOTED_MM:  # is told with others at most
+            found.append((extent, kind))
+            continue
+        reach = reach or KDTree(lumen)
         some = np.asarray(reach.query(place[:: len(place) // 64 + 1])[0]).min()  # so that far points end a search early
         gap = np.asarray(reach.query(place, distance_upper_bound=some + 1e-6)[0])
         if number in severed:
