@@ -9,11 +9,16 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
+
 sys.path.append(str(Path(__file__).parents[1]))  # where `benchmarks` is
 
 from benchmarks.figures import find_row
+from endopilot.dataset.loader import read_dataset
 from endopilot.files import read_json
 from endopilot.report.report_text import tip_rows
+from endopilot.report.scene import visible_devices
+from endopilot.report.still import render_still
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -25,7 +30,7 @@ def main() -> None:
     """Replace each part of the pages between its markers."""
     demo, cta = ROOT / "runs" / "demo", ROOT / "runs" / "cta-thorax"
     if (demo / "manifest.json").exists():
-        shutil.copyfile(demo / "scene.png", IMAGES / "demo.png")
+        _picture(demo / "dataset")
         metrics, record = read_json(demo / "metrics.json"), read_json(demo / "manifest.json")
         _replace("README.md", "demo", _demo(metrics, record))
         _replace("docs/evidence/demo.md", "demo-table", _demo_table(metrics, record))
@@ -40,6 +45,15 @@ def _replace(page: str, name: str, content: str) -> None:
     path, begin, end = ROOT / page, f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     head, rest = path.read_text(encoding="utf-8").split(begin)
     path.write_text(f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}", encoding="utf-8")
+
+
+def _picture(dataset: Path) -> None:
+    """Draw the test navigation in which the tip travels farthest, where it is deepest."""
+    held_out = read_dataset(dataset).of_split(SPLIT)
+    best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
+    trajectory = held_out.trajectory(best, record_shape=True)
+    wire = visible_devices(trajectory, 0, int(trajectory.tip.abscissa[0, :, 0].argmax()))
+    render_still(trajectory.set_up.anatomies[0], wire, IMAGES / "demo.png")
 
 
 def _demo(metrics: dict, record: dict) -> str:
@@ -85,7 +99,7 @@ def _demo_table(metrics: dict, record: dict) -> str:
         "| --- " * 9 + "|",
     ]
     for row in tip_rows(metrics, SPLIT):
-        lines.append("| " + " | ".join([row.title, *(cell.text for cell in row.cells[:8])]) + " |")
+        lines.append("| " + " | ".join([row.title, *row.cells[:8]]) + " |")
     return "\n".join(
         [
             *lines,

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from endopilot.anatomy.centerline import to_cut
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
-from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
+from endopilot.types import Insertion, LumenMask, Volume
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import Polylines
 from endopilot.vessels.surface import Surface, surface_from_mask
@@ -60,8 +60,8 @@ def is_sound(anatomy):
     return True
 
 
-@pytest.mark.parametrize("rotation", [None, Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() @ np.diag([-1, -1, 1])])
-def test_bent_tube_axis_and_radius(rotation):
+def test_bent_tube_axis_and_radius():
+    rotation = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() @ np.diag([-1, -1, 1])
     mask = mask_of(bent_tube, (22, 22, 22), (0.6, 0.6, 0.6), rotation)
     anatomy = extract_anatomy(mask, name="torus")
     line = anatomy.tree.longest_path()
@@ -112,30 +112,17 @@ def test_flaws_of_masks_are_repaired(fork_mask):
     )
     assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
     assert any("bridged" in note for note in anatomy.provenance["notes"])
-    assert any("left out" in note for note in anatomy.provenance["notes"])
-
-
-def save_stl(surface, path):
-    import pyvista
-
-    pyvista.PolyData(surface.vertices, np.insert(surface.faces, 0, 3, axis=1).ravel()).save(path)
 
 
 def test_surface_with_holes_and_inverted_normals(fork_mask, tmp_path):
     wall = surface_from_mask(fork_mask.volume)
     height = wall.vertices[wall.faces].mean(axis=1)[:, 2]
-    opened = Surface(wall.vertices, wall.faces[(height > -19.0) & (height < 19.0)][:, ::-1])
-    save_stl(opened, tmp_path / "open.stl")
+    opened = Surface(wall.vertices, wall.faces[(height > -19.0) & (height < 19.0)].repeat(2, axis=0)[:, ::-1])  # twice
+    pyvista.PolyData.from_regular_faces(opened.vertices, opened.faces).save(tmp_path / "open.stl")
     anatomy = extract_anatomy(read_source(tmp_path / "open.stl"), name="mesh")
     assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
     assert any("capped" in note for note in anatomy.provenance["notes"])
     assert len(anatomy.provenance["source"]["sha256"]) == 64
-
-
-def test_radii_in_another_unit_than_the_positions_are_told():
-    line = np.outer(np.linspace(0.0, 90.0, 4000), [0.0, 0.6, 0.8])
-    with pytest.raises(InputError, match=r"mean radius of 0\.05 mm.*positions and radii"):
-        extract_anatomy(Polylines((line,), (np.full(4000, 0.05),)), name="tree", config=AnatomyConfig(vessel="lca"))
 
 
 def test_the_guiding_catheter_is_one_of_6_french_or_as_wide_as_a_narrower_ostium(fork_mask):
@@ -149,14 +136,7 @@ def test_the_guiding_catheter_is_one_of_6_french_or_as_wide_as_a_narrower_ostium
     assert abs(extract_anatomy(narrow, name="narrow").catheter_radius_mm - 0.5) < 1e-6
 
 
-def test_overlapping_centerlines_become_one_tree():
-    paths = [forked_tree().path(1), forked_tree().path(2)]
-    anatomy = extract_anatomy(Polylines(tuple(p.points for p in paths), tuple(p.radius for p in paths)), name="cl")
-    assert len(anatomy.tree.branches) == 3 and is_sound(anatomy)
-    assert abs(anatomy.tree.branches[0].centerline.abscissa[-1] - 20) < 2.0
-
-
-CUBE = (50, 50, 50)
+CUBE = (36, 36, 36)
 
 
 @pytest.mark.parametrize(
@@ -164,7 +144,7 @@ CUBE = (50, 50, 50)
     [
         (np.zeros(CUBE, dtype=bool), "empty"),
         (np.ones(CUBE, dtype=bool), "solid block"),
-        (np.linalg.norm(np.indices(CUBE) - 25, axis=0) < 20, "no vessel"),
+        (np.linalg.norm(np.indices(CUBE) - 18, axis=0) < 15, "no vessel"),
         (np.random.default_rng(0).random(CUBE) < 0.4, "noise"),
     ],
 )
@@ -172,37 +152,6 @@ def test_what_is_no_vessel_is_refused(voxels, message):
     with pytest.raises(InputError, match=message) as error:
         extract_anatomy(LumenMask(Volume(voxels, np.full(3, 0.5), np.zeros(3), np.eye(3))), name="bad")
     assert "\n" not in str(error.value)
-
-
-def test_a_known_ostium_beside_the_axis_is_joined_by_a_straight_line():
-    def wide_tube(points):
-        return np.minimum(6.0 - np.hypot(points[..., 0], points[..., 1]), points[..., 2])
-
-    ostium = Insertion(np.array([4.0, 0.5, 1.0]), np.array([0.0, 0.0, 1.0]))
-    mask = mask_of(wide_tube, (8, 8, 45), (0.8, 0.8, 0.8))
-    anatomy = extract_anatomy(LumenMask(mask.volume, ostium), name="wide")
-    line = anatomy.tree.branches[0].centerline
-    np.testing.assert_allclose(anatomy.insertion.position, ostium.position, atol=1e-9)
-    assert is_sound(anatomy)
-    beside = np.hypot(line.points[:, 0], line.points[:, 1])
-    assert np.all(np.diff(beside[line.points[:, 2] < 10]) < 1e-6)
-    assert beside[line.points[:, 2] > 20].max() < 0.5
-    bend = np.diff(line.points, axis=0) / np.linalg.norm(np.diff(line.points, axis=0), axis=1, keepdims=True)
-    assert (bend[1:] * bend[:-1]).sum(axis=1).min() > 0.95
-
-
-def test_a_line_is_extended_only_as_far_as_the_vessel_is_round():
-    axis = np.arange(-6.0, 6.2, 0.2)
-    height = np.arange(-10.0, 10.2, 0.2)
-    z, y, x = np.meshgrid(height, axis, axis, indexing="ij")
-    half = np.where(z < 0, 3.0, 3.0 - 0.2 * z)  # the smaller half-axis; the larger one grows
-    wall = 1.0 - np.hypot(x / np.where(z < 0, 3.0, 3.0 + 0.3 * z), y / half)
-    field = DistanceMap(3.0 * wall, 0.2, np.array([-6.0, -6.0, -10.0]))
-    points = np.stack([np.zeros(9), np.zeros(9), np.arange(-8.0, 1.0)], axis=-1)
-    line, radius = to_cut(field, points, np.full(9, 3.0), 1.0)
-    # the smaller half-axis is 0.75 · 3 mm at z = 3.75 mm
-    assert line[-1, 2] == pytest.approx(3.0, abs=0.3)
-    np.testing.assert_allclose(radius[9:], [3.0, 2.6, 2.4], atol=0.15)
 
 
 def test_mask_away_from_the_ostium_is_refused(fork_mask):

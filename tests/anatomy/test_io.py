@@ -25,7 +25,14 @@ def anatomy():
 
 
 def test_round_trip_is_exact(anatomy, tmp_path):
+    import pyvista
+    import SimpleITK
+
     write_anatomy(anatomy, output=tmp_path / "a")
+    lines = pyvista.read(tmp_path / "a" / "centerline.vtp")  # other programs read it too
+    assert lines.n_lines == 3 and "MaximumInscribedSphereRadius" in lines.point_data
+    image = SimpleITK.ReadImage(str(tmp_path / "a" / "lumen.nrrd"))
+    assert np.allclose(image.GetOrigin(), anatomy.distance_map.origin_mm)
     back = read_anatomy(tmp_path / "a")
     assert back.name == anatomy.name and back.catheter_radius_mm == 1.5 and back.provenance == anatomy.provenance
     assert np.array_equal(back.insertion.direction, anatomy.insertion.direction)
@@ -52,40 +59,42 @@ def test_identity_changes_with_everything_that_affects_a_wire(anatomy):
     values = field.values.copy()
     values[2, 3, 4] += 1e-3
     wider = replace(root, centerline=replace(root.centerline, radius=root.centerline.radius + 1e-3))
+    fields = (
+        {"values": values}, {"spacing_mm": field.spacing_mm * 1.001}, {"origin_mm": field.origin_mm + 1e-3},
+        {"values": field.values.reshape(field.values.shape[::-1])},
+    )  # fmt: skip
+    enters = {"position": insertion.position + 1e-3}, {"direction": -insertion.direction}
     changed = [
-        replace(anatomy, distance_map=replace(field, values=values)),
-        replace(anatomy, distance_map=replace(field, spacing_mm=field.spacing_mm * 1.001)),
-        replace(anatomy, distance_map=replace(field, origin_mm=field.origin_mm + 1e-3)),
-        replace(anatomy, distance_map=replace(field, values=field.values.reshape(field.values.shape[::-1]))),
-        replace(anatomy, insertion=replace(insertion, position=insertion.position + 1e-3)),
-        replace(anatomy, insertion=replace(insertion, direction=-insertion.direction)),
+        *(replace(anatomy, distance_map=replace(field, **change)) for change in fields),
+        *(replace(anatomy, insertion=replace(insertion, **change)) for change in enters),
         replace(anatomy, catheter_radius_mm=1.4),
         replace(anatomy, tree=replace(anatomy.tree, branches=(wider, *others))),
     ]
     assert len({anatomy.identity, *(other.identity for other in changed)}) == 1 + len(changed)
 
 
-def test_a_record_of_another_vessel_is_refused(anatomy, tmp_path):
+@pytest.mark.parametrize("file", ["centerline.vtp", "lumen.nrrd"])
+def test_a_changed_file_is_refused(anatomy, tmp_path, file):
+    write_anatomy(anatomy, output=tmp_path / "a")
+    content = (tmp_path / "a" / file).read_bytes()
+    for changed in (content[:-1], content[:100] + b"x" + content[101:]):
+        (tmp_path / "a" / file).write_bytes(changed)
+        with pytest.raises(InputError, match=rf"{file}: differs from what anatomy\.json records"):
+            read_anatomy(tmp_path / "a")
+
+
+@pytest.mark.parametrize("odd", [None, 7, -1, "x", [], {}, [1.0, 2.0, 3.0], float("nan")])
+def test_a_record_with_an_odd_entry_is_refused_in_one_line_or_means_the_same(anatomy, tmp_path, odd):
     write_anatomy(anatomy, output=tmp_path / "a")
     path = tmp_path / "a" / "anatomy.json"
     record = json.loads(path.read_text())
-    assert record["identity"] == anatomy.identity
-    record["insertion"]["position_mm"][0] += 0.5
-    path.write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"anatomy\.json: identity is not that of the vessel in it"):
-        read_anatomy(tmp_path / "a")
-
-
-def test_other_programs_read_it(anatomy, tmp_path):
-    import pyvista
-    import SimpleITK
-
-    write_anatomy(anatomy, output=tmp_path / "a")
-    lines = pyvista.read(tmp_path / "a" / "centerline.vtp")
-    assert lines.n_lines == 3 and "MaximumInscribedSphereRadius" in lines.point_data
-    image = SimpleITK.ReadImage(str(tmp_path / "a" / "lumen.nrrd"))
-    assert np.allclose(image.GetOrigin(), anatomy.distance_map.origin_mm)
-    assert "left-posterior-superior" in (tmp_path / "a" / "lumen.nrrd").read_bytes()[:500].decode("latin-1")
+    changes = [{name: odd} for name in record] + [{"insertion": record["insertion"] | {"position_mm": odd}}]
+    for change in changes:
+        path.write_text(json.dumps(record | change))
+        try:
+            assert read_anatomy(tmp_path / "a").identity == anatomy.identity
+        except InputError as error:
+            assert str(error).startswith(str(tmp_path)) and "\n" not in str(error)
 
 
 def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):

@@ -34,27 +34,6 @@ def brute_force(tree, points):
     return result
 
 
-def test_agrees_with_brute_force():
-    tree = forked_tree()
-    points = np.random.default_rng(0).uniform((-2, -1, 1), (8, 1, 30), (4000, 3))
-    exact = brute_force(tree, points)
-    inside = exact[1] < 1.5
-    found = project_tip(tree, INSERTION, points)
-    assert np.allclose(found.abscissa[inside], exact[0][inside], atol=1e-9)
-    assert np.allclose(found.offset[inside], exact[1][inside], atol=1e-9)
-    assert np.array_equal(found.branch[inside], exact[2][inside])
-
-
-def test_wall_of_a_wide_vessel_is_not_given_to_a_thin_neighbour():
-    tree = forked_tree(angle_deg=5.0, radius=(2.0, 0.4))
-    point = np.array([[1.2, 0.0, 28.0]])
-    found = project_tip(tree, INSERTION, point)
-    # The thin branch passes 0.5 mm away, outside of its own lumen; the wide vessel's axis is 1.2 mm away.
-    assert found.branch[0] == 1
-    assert abs(found.offset[0] - 1.2) < 1e-9
-    assert found.radius[0] == 2.0
-
-
 def test_a_point_is_projected_to_the_same_bits_whatever_the_others():
     tree = forked_tree()
     points = np.random.default_rng(1).uniform((-2, -1, -4), (8, 1, 30), (500, 3))  # behind the ostium too
@@ -75,8 +54,8 @@ def test_agrees_with_brute_force_on_a_whole_tree():
     tree, _ = make_patient_tree(AtlasConfig(seed=3), 0)
     rng = np.random.default_rng(0)
     centre, size = (np.concatenate([getattr(b.centerline, n) for b in tree.branches]) for n in ("points", "radius"))
-    chosen = rng.integers(0, len(centre), 3000)
-    points = centre[chosen] + 0.4 * size[chosen, None] * rng.normal(size=(3000, 3))
+    chosen = rng.integers(0, len(centre), 1500)
+    points = centre[chosen] + 0.4 * size[chosen, None] * rng.normal(size=(1500, 3))
     start = tree.branches[0].centerline.points
     insertion = Insertion(start[0], (start[1] - start[0]) / np.linalg.norm(start[1] - start[0]))
     points = points[(points - start[0]) @ insertion.direction > 0.5]

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
+from analytic_shapes import forked_tree, mask_of, torus_distance, tree_distance
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.catheter_axis import lean_between, turned_axis
-from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample, smooth_union
+from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample
 from endopilot.anatomy.labels import label_tree
 from endopilot.anatomy.tree import make_centerline, parallel_transport, tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
@@ -46,8 +46,8 @@ def test_tangents_are_exact_to_second_order_up_to_both_ends():
     assert np.linalg.norm(tangents(points) - exact, axis=1).max() < 2e-3
 
 
-@pytest.mark.parametrize("tilt_deg", [0.3, 20.0, 89.0, 120.0])
-@pytest.mark.parametrize("side_deg", [-170.0, -45.0, 0.0, 90.0, 179.0])
+@pytest.mark.parametrize("tilt_deg", [0.3, 20.0, 120.0])
+@pytest.mark.parametrize("side_deg", [-170.0, 0.0, 90.0])
 def test_a_turned_axis_leans_by_its_angle_to_its_side(tilt_deg, side_deg) -> None:
     random = np.random.default_rng(round(tilt_deg + side_deg) % 97)
     axis = random.standard_normal(3)
@@ -86,16 +86,6 @@ def test_cone_has_its_exact_distance():
     assert np.abs(found.values - exact)[middle].max() < 1e-3
 
 
-def test_neighbouring_spheres_leave_no_scallops():
-    z = np.arange(0, 31, 1.5)
-    tree = VesselTree(
-        (Branch(make_centerline(np.outer(z, [0, 0, 1.0]), np.full(21, 1.0)), -1, np.zeros(21, int)),), ("v",)
-    )
-    found = distance_map_from_spheres(tree, spacing_mm=0.25)
-    on_wall = np.stack([np.ones(200), np.zeros(200), np.linspace(5, 25, 200)], axis=1)
-    assert np.abs(sample(found, on_wall)).max() < 0.02
-
-
 def test_fillet_widens_the_fork_and_nothing_else():
     tree = forked_tree()
     found = distance_map_from_spheres(tree, spacing_mm=0.8)
@@ -106,14 +96,8 @@ def test_fillet_widens_the_fork_and_nothing_else():
     assert 0.05 < (found.values - exact).max() < 0.5
 
 
-def test_smooth_union_does_not_bulge_where_tubes_carry_on():
-    x = np.arange(-10, 10.1, 0.5, dtype=np.float32)
-    tube = 3 - np.hypot(*np.meshgrid(x, x))[None].repeat(20, axis=0)
-    assert np.abs(smooth_union(tube, tube.copy(), spacing_mm=0.5, fillet_mm=1.0) - tube).max() < 1e-6
-
-
-@pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.45, 0.45, 0.6)])
-def test_mask_gives_a_sub_voxel_distance(spacing):
+def test_mask_gives_a_sub_voxel_distance():
+    spacing = 0.45, 0.45, 0.6
     rotation = Rotation.from_rotvec([0.3, 0.2, 0.5]).as_matrix()
     mask = mask_of(lambda p: torus_distance(p, 2.0), (25, 25, 9), spacing, rotation)
     found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.5)
@@ -121,14 +105,6 @@ def test_mask_gives_a_sub_voxel_distance(spacing):
     error = (found.values - exact)[np.abs(exact) < 2.0]
     assert np.sqrt(np.mean(error**2)) < 0.1 * max(spacing)
     assert abs(error.mean()) < 0.05 * min(spacing)
-
-
-def test_thin_vessel_of_one_voxel_radius_survives():
-    mask = mask_of(lambda p: torus_distance(p, 0.5), (23, 23, 2), (0.5, 0.5, 0.5))
-    found = distance_map_from_surface(surface_from_mask(mask.volume), spacing_mm=0.25)
-    angle = np.linspace(0, 2 * np.pi, 100)
-    axis = BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    assert sample(found, axis).min() > 0.1
 
 
 def test_catheter_opens_the_ostium():

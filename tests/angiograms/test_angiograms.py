@@ -96,16 +96,6 @@ def test_projected_shapes_lie_on_their_masks(cines):
                 assert len(lies) > 5 and lies.mean() > 0.97, (folder.name, frame, kind)
 
 
-def test_masks_are_as_wide_as_the_vessel(fork, cines):
-    """The lumen's silhouette has the area of its tubes: 2 r times their length in the image."""
-    folder, _, truth = cines[0]
-    centre = truth["centerline_px"][0]
-    radius_px = truth["centerline_radius_mm"] * 1100 / 0.9 / 765
-    step = np.linalg.norm(np.diff(centre, axis=0), axis=1) * (np.diff(truth["centerline_branch"]) == 0)
-    area = (picture(folder, "masks", 0) & 1).sum()
-    assert area == pytest.approx((2 * radius_px[1:] * step).sum(), rel=0.25)
-
-
 def test_tips_and_keypoints_are_those_of_the_devices(cines):
     _, _, truth = next(one for one in cines if one[1]["devices"])
     np.testing.assert_allclose(truth["wire_keypoints_mm"][:, 0], truth["wire_mm"][:, 0], atol=1e-5)
@@ -185,7 +175,9 @@ def test_coco_has_the_masks_and_keypoints(made, cines):
     assert seen == set(CLASSES)
 
 
-def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(made, patient, tmp_path):
+def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(made, patient, fork, tmp_path):
+    assert read_anatomy(made / "patients" / "fork").identity == fork.identity
+    assert (made / "samples.png").stat().st_size > 1000
     output = tmp_path / "again"
     shutil.copytree(made, output)
     cut, kept = sorted((output / "cines").iterdir())[:2]
@@ -206,13 +198,6 @@ def test_a_cluster_gives_the_same_bits(made, patient, tmp_path, monkeypatch):
     monkeypatch.setattr("endopilot.dataset.workers.run_on_cluster", run)
     make_angiograms([patient], output=tmp_path / "there", device=STACK, config=CONFIG, scheduler="tcp://here:1")
     assert hashes(tmp_path / "there") == hashes(made)
-
-
-def test_the_patient_and_a_picture_are_part_of_it(made, fork):
-    assert read_anatomy(made / "patients" / "fork").identity == fork.identity
-    splits = json.loads((made / "manifest.json").read_text())["splits"]
-    assert splits == {"train": {"patients": 1, "cines": CINES, "frames": CINES * FRAMES}}
-    assert (made / "samples.png").stat().st_size > 1000
 
 
 def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monkeypatch):

@@ -12,12 +12,11 @@ import pytest
 from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy import distance
 from endopilot.anatomy.distance import distance_map_from_spheres, sample
-from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
-from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses, with_side_branches
+from endopilot.atlas.branching import Vessel, lumens_collide, stenoses
 from endopilot.atlas.population import Draw, Population, population_of
-from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
+from endopilot.atlas.variation import TIGHTEST, bent, catheter_direction, ectasia
 
 COUNT = 32
 COARSE = partial(distance_map_from_spheres, spacing_mm=3.0)
@@ -53,12 +52,12 @@ REAL = {
 
 @pytest.fixture(scope="module")
 def measured():
-    """Return the quantities of `COUNT` patients of a kind, of whom every eighth has a fine wall."""
+    """Return the quantities of `COUNT` patients of a kind, of whom every twelfth has a fine wall."""
     found = {}
     for kind in REAL:
         values = defaultdict(list)
         for index in range(COUNT):
-            fine = index % 8 == 0
+            fine = index % 12 == 0
             wall = distance_map_from_spheres if fine else COARSE
             with patch.object(distance, "distance_map_from_spheres", wall):
                 patient = make_patient(AtlasConfig(vessel=kind, seed=0), index)
@@ -79,11 +78,6 @@ def test_patients_resemble_real_ones(measured, kind, quantity):
     assert np.mean((values >= low) & (values <= high)) >= 0.6
     spread = float(np.diff(np.quantile(values, (0.05, 0.95)))[0])
     assert 0.4 <= spread / (high - low) <= 2.0
-
-
-def test_bends_reach_the_tightest_that_a_lumen_can_make(measured):
-    assert max(measured["rca"]["largest κ·r"]) > 0.8
-    assert min(measured["rca"]["largest κ·r"]) < 0.4
 
 
 def test_sections_are_as_far_from_round_as_real_ones(measured):
@@ -123,47 +117,8 @@ def test_the_textbook_bends_nothing_and_draws_nothing():
     assert drawn == {} and draw.generator.random() == np.random.default_rng(0).random()
 
 
-@pytest.mark.parametrize("angle", [15.0, 50.0])
-def test_a_vessel_gives_way_to_the_side_opposite_to_its_branch(angle):
-    points, radius = line_and_radius()
-    varies = {"waves_deg": (1e-6, 1e-6), "deflection_deg": (10.0, 0.5, 5.0, 20.0)}
-    found = []
-    for seed in range(20):
-        fork = Fork(60, (0.5, 0.8, 0.0), angle)
-        moved = bent(drawing(seed, **varies), points, radius, forks=[fork])
-        behind = moved[65] - moved[60]
-        found.append(behind / np.linalg.norm(behind))
-    mean = np.mean(found, axis=0)
-    assert mean[1] < -0.5 * np.sin(np.deg2rad(angle)) and abs(mean[2]) < 0.5 * abs(mean[1])
-    # Over 2.5 mm most of the turn is made, and far behind the vessel has its direction again.
-    turns = np.rad2deg(np.arccos(np.clip(np.array(found)[:, 0], -1, 1)))
-    assert np.all(turns > 0.5 * angle) and np.all(turns < angle)
-
-
-def test_an_opened_fork_has_the_drawn_angles():
-    points, _ = line_and_radius()
-    other = points[20] + np.stack([np.zeros(60), -0.5 * np.arange(60), np.zeros(60)], axis=1)
-    exact = ((30.0, 1e-6, 29.0, 31.0), (55.0, 1e-6, 54.0, 56.0))
-    own, out = opened_fork(drawing(0), points, other, 20, 2.0, exact)
-    np.testing.assert_allclose(out[0], own[20], atol=1e-9)
-    for line, at, angle in ((own, 20, 30.0), (out, 0, 55.0)):
-        chord = line[at + 8] - line[at]
-        arriving = own[20] - own[12]
-        cosine = chord @ arriving / np.linalg.norm(chord) / np.linalg.norm(arriving)
-        assert np.rad2deg(np.arccos(cosine)) == pytest.approx(angle, abs=2.0)
-
-
-def test_draws_follow_their_distribution():
-    draw = drawing(0)
-    values = [drawn_from(draw, (20.0, 0.5, 8.0, 60.0)) for _ in range(2000)]
-    assert min(values) >= 8.0 and max(values) <= 60.0
-    assert np.median(values) == pytest.approx(20.0, rel=0.05)
-    # 5 % of a log-normal distribution lie above median · exp(1.645·σ) = 45.5; the cuts take 3 and 1 % off.
-    assert np.mean(np.array(values) > 45.5) == pytest.approx(0.043, abs=0.015)
-
-
 def test_catheters_keep_clear_of_the_vessels_and_meet_them_at_the_drawn_angle():
-    for index in range(6):
+    for index in range(3):
         anatomy = make_patient(AtlasConfig(seed=21), index)
         path, direction = anatomy.tree.longest_path(), anatomy.insertion.direction
         at = int(np.searchsorted(path.abscissa, 10.0))
@@ -173,25 +128,6 @@ def test_catheters_keep_clear_of_the_vessels_and_meet_them_at_the_drawn_angle():
         tube = anatomy.insertion.position - np.outer(np.arange(4.0, 29.0), direction)
         # Where the tube met another lumen, the map would be deeper than the tube is wide.
         assert sample(anatomy.distance_map, tube).max() < anatomy.catheter_radius_mm + 0.1
-
-
-@pytest.mark.parametrize("beside", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-def test_a_catheter_avoids_a_vessel_that_comes_back_past_its_ostium(beside):
-    # Up 14 mm, over a half circle of 5 mm, and down again 10 mm beside the first limb to 26 mm below the ostium.
-    arc = np.linspace(0.0, np.pi, 40)[1:]
-    up, down = np.arange(0.0, 14.0, 0.5), np.arange(14.0, -26.0, -0.5)
-    across = np.concatenate([np.zeros(len(up)), 5 - 5 * np.cos(arc), np.full(len(down), 10.0)])
-    height = np.concatenate([up, 14 + 5 * np.sin(arc), down])
-    line = np.stack([across * beside[0], across * beside[1], height], axis=1)
-    tree = tree_from_lines([Line(line, np.full(len(line), 2.0), -1, 0)])
-    steep = {"catheter_deg": (40.0, 1e-6, 39.0, 41.0)}
-    for seed in range(6):
-        direction, drawn = catheter_direction(drawing(seed, **steep), tree, 0.9, 30.0)
-        assert drawn["catheter_angle_deg"] == pytest.approx(40.0, abs=0.1)
-        tube = line[0] - np.arange(2.0, 30.0)[:, None] * direction
-        limb = line[len(up) :]
-        gap = np.linalg.norm(limb[:, None] - tube[None], axis=2).min() - 2.0 - 0.9
-        assert gap > -0.05
 
 
 def test_inscribed_spheres_stay_inscribed_in_sections_that_are_not_round():
@@ -229,15 +165,6 @@ def test_a_narrow_fork_keeps_its_lumens_in_contact_for_longer():
     side = points[60] + 0.5 * np.arange(60)[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
     vessels = [Vessel(points, radius, ()), Vessel(side, np.full(60, 1.0), (), 0, 60)]
     assert lumens_collide(vessels) and not lumens_collide(vessels, 14.0)
-    plan = SidePlan(
-        section="RV",
-        origin=60,
-        length_mm=25.0,
-        diameter_mm=2.0,
-        courses=((0.0, (0.2, 1.0, 0.0)),),
-        angle_deg=(20.0, 24.0),
-    )
-    assert len(with_side_branches(drawing(0, carina_mm=14.0), vessels[:1], [plan])) == 2
 
 
 def test_an_ectasia_widens_a_vessel_where_it_is_recorded():
@@ -250,13 +177,3 @@ def test_an_ectasia_widens_a_vessel_where_it_is_recorded():
         assert np.all(widening[beyond] < 1.001) and 1.4 <= widening.max() <= 2.0
     found, widening = ectasia(drawing(0), along)
     assert found == [] and np.all(widening == 1)
-
-
-def test_left_mains_widen_at_their_fork():
-    widened = []
-    for index in range(16):
-        first = make_patient_tree(AtlasConfig(vessel="lca", seed=4), index)[0].branches[0].centerline
-        if first.abscissa[-1] > 8.0:
-            widened.append(first.radius[-1] / np.interp(first.abscissa[-1] - 7.0, first.abscissa, first.radius))
-    # The textbook's left mains keep their calibre within 5 %; the flare is drawn from 0 to 35 %.
-    assert len(widened) >= 3 and 1.05 < np.mean(widened) < 1.35

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.anatomy.compare import compare_with_atlas, compared, scaled_distance, together
-from benchmarks.anatomy.vessel_shape import curvature_and_torsion, vessel_shape
+from benchmarks.anatomy.compare import compare_with_atlas, scaled_distance
+from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy.distance import distance_map_from_spheres
 from endopilot.anatomy.io import write_anatomy
-from endopilot.anatomy.labels_tree import LCA_SECTIONS, RCA_SECTIONS
+from endopilot.anatomy.labels_tree import RCA_SECTIONS
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
@@ -63,21 +63,6 @@ def test_a_circle_has_its_curvature_turn_and_tortuosity():
     assert shape["branches > 10 mm"] == [1.0] and shape["side-branch angle, °"] == []
 
 
-def test_a_helix_has_its_curvature_and_torsion():
-    # κ = a/(a² + b²), τ = b/(a² + b²) for radius a and rise b a radian.
-    a, b = 8.0, 6.0
-    turn = np.linspace(0.0, 4 * np.pi, 900)
-    helix = np.stack([a * np.cos(turn), a * np.sin(turn), b * turn], axis=1)
-    bends, twists, radius, _ = curvature_and_torsion(
-        anatomy_of([(helix, constant(helix, 1.0), -1, 0)]).tree.longest_path()
-    )
-    # The blur shrinks a to a·exp(−σ²ω²/2), where ω = 1/√(a² + b²) is the turn a mm.
-    small = a * np.exp(-0.5 * 4.0 / (a**2 + b**2))
-    assert np.median(bends) == pytest.approx(small / (small**2 + b**2), rel=0.01)
-    assert np.median(twists) == pytest.approx(b / (small**2 + b**2), rel=0.01)
-    assert radius == pytest.approx(np.ones(len(radius)))
-
-
 @pytest.mark.parametrize(("side", "gives_way"), [(60.0, 0.0), (35.0, 20.0), (95.0, 10.0)])
 def test_a_fork_has_its_angles_and_calibre(side, gives_way):
     across = np.deg2rad([-gives_way, side])
@@ -97,22 +82,6 @@ def test_a_fork_has_its_angles_and_calibre(side, gives_way):
     assert shape["branches > 10 mm"] == [2.0]
 
 
-def test_the_left_mains_fork_is_measured_by_its_sections():
-    main = straight((0, 0, 0), (1, 0, 0), 8)
-    lad = straight((8, 0, 0), (np.cos(np.deg2rad(30)), np.sin(np.deg2rad(30)), 0), 60)
-    lcx = straight((8, 0, 0), (np.cos(np.deg2rad(50)), -np.sin(np.deg2rad(50)), 0), 40)
-    trunk = np.concatenate([main, lad[1:]])
-    lines = [(trunk, constant(trunk, 2.2), -1, 0), (lcx, constant(lcx, 1.6), 0, len(main) - 1)]
-    anatomy = anatomy_of(lines, names=LCA_SECTIONS, branch_0="5", branch_1="6", branch_2="11")
-    shape = vessel_shape(anatomy)
-    assert shape["LM→LAD turn, °"] == pytest.approx([30], abs=0.5)
-    assert shape["LM→LCx turn, °"] == pytest.approx([50], abs=0.5)
-    assert shape["LAD–LCx angle, °"] == pytest.approx([80], abs=0.5)
-    assert shape["left main's length, mm"] == pytest.approx([8.0])
-    assert shape["radius at the left main's fork, mm"] == pytest.approx([2.2])
-    assert "LM→LAD turn, °" not in vessel_shape(anatomy_of(lines))
-
-
 def test_the_distance_is_a_shift_in_standard_deviations():
     generator = np.random.default_rng(0)
     one = generator.normal(size=4000)
@@ -121,15 +90,6 @@ def test_the_distance_is_a_shift_in_standard_deviations():
     assert scaled_distance([1.0, 2.0], [2.0, 1.0]) == 0.0
     assert scaled_distance([1.0], [1.0]) == 0.0
     assert scaled_distance([1.0], [2.0]) is None and scaled_distance([], [2.0]) is None
-
-
-def test_a_row_holds_medians_and_percentiles_of_both_sets():
-    given = together({"length": [float(value)]} for value in range(101))
-    (row, only) = compared("rca", given, {"length": [50.0] * 3, "width": [1.0]})
-    assert (row["given_count"], row["given"], row["given_p5"], row["given_p95"]) == (101, 50.0, 5.0, 95.0)
-    # |value − 50| has a mean of 25.2; the pooled spread is 29.15/√2.
-    assert row["distance"] == pytest.approx(25.248 / (29.155 / np.sqrt(2)), rel=5e-3)
-    assert only["quantity"] == "width" and only["given"] is None and only["distance"] is None
 
 
 def test_anatomies_are_compared_with_the_atlas_of_their_kind(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks import against
-from benchmarks.figures import Bar, all_passed, show_figures
+from benchmarks.figures import Bar, all_passed
 
 ROOT = Path(__file__).parents[2]
 SHOWN = re.compile(r"python -m benchmarks ([a-z][a-z-]*)((?: [^\n`|&;]*)?)")
@@ -66,22 +66,6 @@ def test_a_missed_bar_is_found_wherever_it_stands() -> None:
         assert not all_passed(figures)
     assert Bar(2.0).met(2.0) and not Bar(2.0).met(2.1) and not Bar(2.0).met(float("nan"))
     assert Bar(2.0, at_least=True).met(2.0) and not Bar(2.0, at_least=True).met(1.9)
-
-
-def test_figures_are_shown_as_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    figures = {
-        "speed": 2.5,
-        "dice": {"mean": 0.75, "worst": 0.25},
-        "radius": {"mean": 0.5, "worst": 1.5},
-        "by_kind": {"rca": {"right": 0.125}, "lca": {"wrong": 7}},
-    }
-    show_figures(figures, as_json=False)
-    said = capsys.readouterr().out
-    assert re.search(r"speed +2.5\n", said)
-    assert re.search(r"dice\W+0.75\W+0.25\W+radius\W+0.5\W+1.5", said)
-    show_figures({"by_kind": {"rca": {"a": 0.1, "b": 0.2, "c": 0.3}}}, as_json=False)
-    assert re.search(r"by\W+kind\W+rca\W+a\W+0.1\W+b\W+0.2\W+c\W+0.3", capsys.readouterr().out)
-    assert re.search(r"by\W+kind\W+right\W+wrong", said) and re.search(r"rca\W+0.125\W+-\W+lca\W+-\W+7", said)
 
 
 def python_that_prints(path: Path, *outputs: dict) -> Path:

@@ -1,4 +1,4 @@
-"""The aorto-iliac path: its draws, a wire in it against a beam on an elastic bed, stiffer wires, and a rigid wall."""
+"""The aorto-iliac path: its draws, a wire in it against a beam on an elastic bed, and stiffer wires."""
 
 from __future__ import annotations
 
@@ -62,19 +62,15 @@ def test_a_wire_straightens_waves_as_a_beam_on_an_elastic_bed_does(waves, modulu
     assert found.force_n == pytest.approx(bed * (d * np.exp(stiffening * d**2)).mean() * length, rel=0.03)
 
 
-def test_a_stiffer_wire_straightens_more_and_a_rigid_wall_bears_more() -> None:
+def test_a_stiffer_wire_straightens_more() -> None:
     path = draw_path(np.random.default_rng(5))
     anatomy = path.anatomy()
     soft, stiff = (straighten(path, anatomy, stiff_wire(modulus, friction=0.05)) for modulus in (9.5, 158.4))
-    rigid = straighten(path, anatomy, stiff_wire(158.4, friction=0.05), rigid=True)
-    assert all(each.valid and each.through for each in (soft, stiff, rigid))
+    assert all(each.valid and each.through for each in (soft, stiff))
     assert 1.0 < soft.largest_mm < 0.7 * stiff.largest_mm
     assert 0 < soft.mean_mm < soft.largest_mm
     assert stiff.tortuosity < soft.tortuosity < soft.tortuosity_before
-    assert rigid.largest_mm < 0.2 and rigid.tortuosity == pytest.approx(rigid.tortuosity_before, abs=5e-3)
-    assert rigid.force_n > 1.2 * stiff.force_n > stiff.force_n > soft.force_n
-    held = straighten(path, anatomy, replace(stiff_wire(158.4, friction=0.05), push_limit_n=0.1))
-    assert held.valid and not held.through
+    assert stiff.force_n > soft.force_n
 
 
 def test_paths_are_as_long_and_tortuous_as_published_and_differ() -> None:

@@ -9,20 +9,14 @@ import pytest
 
 from benchmarks.robot.twist import (
     Run,
-    Sides,
-    at_commands,
     bench_twist,
-    correlation,
     dead_bands,
-    drive_of,
     passages,
     rotation_runs,
     steps_to,
-    tip_in_run,
 )
 from endopilot.anatomy.io import write_anatomy
 from endopilot.errors import InputError
-from endopilot.robot.log import RobotLog
 from endopilot.robot.replay import EpisodeReplay
 from endopilot.types import Anatomy
 
@@ -63,41 +57,6 @@ def test_dead_bands_of_tips_that_rest_then_creep_and_leap() -> None:
     assert per_step == pytest.approx(3 / 10)
 
 
-def test_tips_between_commands_as_long_as_they_are_seen() -> None:
-    commanded, nothing = np.array([True, False, True, True, False, True]), np.full((6, 3), np.nan)
-    log = RobotLog(
-        name="made up",
-        time_s=np.array([0.0, 0.04, 0.1, 0.2, 0.24, 0.3]),
-        episode=np.zeros(6, dtype=int),
-        command=np.where(commanded[:, None, None], np.zeros((6, 1, 2)), np.nan),
-        encoders=np.full((6, 1, 2), np.nan),
-        load=np.full((6, 1, 2), np.nan),
-        tip=nothing,
-        pixel=nothing[:, :2],
-        used=commanded,
-    )
-    found = at_commands(log, np.array([0.04, 0.24]), np.array([[1.0, 0, 0], [2.0, 0, 0]]))
-    assert np.array_equal(found[:, 0], [1, np.nan, 2, np.nan], equal_nan=True)
-    assert len(tip_in_run(Run(0, 3, reverses=False, advanced_mm=0.0), found)) == 1
-
-
-def test_sides_of_a_line_change_sign(fork: Anatomy) -> None:
-    line = fork.tree.branches[0].centerline.points
-    along = line[10] - line[9]
-    ray = np.array([0.0, 0.0, 1.0]) if abs(along[2]) < 0.9 * np.linalg.norm(along) else np.array([1.0, 0.0, 0.0])
-    across = np.cross(ray, along / np.linalg.norm(along))
-    left, right = Sides(fork, ray)(line[[10, 10]] + 0.3 * np.stack([across, -across]))
-    assert left == pytest.approx(-right, abs=1e-6) and abs(left) == pytest.approx(0.3, abs=0.05)
-
-
-def test_correlation_has_bounds_over_episodes() -> None:
-    draw = np.random.default_rng(1)
-    signals = [draw.standard_normal(40) for _ in range(12)]
-    r, low, high = correlation([(x, x + draw.standard_normal(40)) for x in signals])
-    assert low < r < high and r == pytest.approx(np.sqrt(0.5), abs=0.1)
-    assert correlation([(x, -x) for x in signals]) == pytest.approx((-1, -1, -1))
-
-
 def test_a_fork_is_passed_once_and_the_branch_compared(fork: Anatomy) -> None:
     ways = [k for k, branch in enumerate(fork.tree.branches) if branch.parent == 0]
     assert len(ways) == 2
@@ -130,13 +89,6 @@ def test_a_fork_is_passed_once_and_the_branch_compared(fork: Anatomy) -> None:
     assert passages(replay(wrong), fork) == [False]
     assert passages(replay(behind), fork) == [False]  # not in time
     assert passages(replay(right, given=2), fork) == []
-
-
-def test_where_rotation_is_lost() -> None:
-    twist, play, none = (drive_of(turns, 3e-4, 900.0).wire for turns in ("twist", "play", "none"))
-    assert (twist.transmission.length_mm, twist.play_rad) == (900.0, 0.0)
-    assert play.transmission.length_mm == 0.0 and play.play_rad > 5
-    assert none.transmission.length_mm == none.play_rad == 0.0
 
 
 def test_a_log_is_compared_with_its_replay(fork: Anatomy, tmp_path: Path) -> None:

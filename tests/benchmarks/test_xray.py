@@ -58,18 +58,6 @@ def test_anatomies_of_ones_own_lie_on_the_table(fork, vessel, tmp_path):
         next(draw_scenes(SceneConfig(given=(tmp_path / "absent",))))
 
 
-def test_a_row_of_processed_images_keeps_views_apart():
-    from benchmarks.imaging.processing import _row
-
-    def exposure(views: int, *, wire: bool = True, found: bool = True) -> Exposure:
-        errors = {"along_px": 1.0, "across_px": 0.5, "along_mm": 0.2, "space_mm": 0.3, "deviations": 9.0}
-        return Exposure(views, 1.0, 0.0, "AP", wire, found, **(errors if found else {}))
-
-    row = _row("any", [exposure(2), exposure(2, found=False), exposure(1), exposure(1, wire=False)], 0.1)
-    assert (row["along_px"], row["missed"], row["missed_one_view"], row["false_alarms"]) == (1.0, 0.5, 0.0, 1.0)
-    assert row["in_own_95"] == 0.0
-
-
 def test_what_is_wrong_counts_as_said_unless_it_is_called_found():
     def search(status: str, **changes) -> Search:
         return Search(**vars(exposure(found=status != "not found", **changes)), said=status, patient="rca")

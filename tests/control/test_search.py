@@ -79,7 +79,7 @@ def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch,
 def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None:
     belief, course = found
     like = belief.simulator
-    again = Simulator(side_branch.anatomy, side_branch.stack, config=like.config, sharing=[like])
+    again = Simulator(side_branch.anatomy, side_branch.stack, config=like.config)
     again.copy_worlds([0], of=like)
     for k, control in enumerate(course.control):
         for _ in range(5):  # as `drive_period` does

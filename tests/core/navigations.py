@@ -18,7 +18,7 @@ from endopilot.simulation.rod import lay_out
 from endopilot.types import Insertion
 
 WORLDS, SAMPLES = 5, 2
-CONFIG = SimulatorConfig(element_mm=1.0, threads=1)
+CONFIG = SimulatorConfig(element_mm=1.5, time_step_s=0.025, threads=1)
 
 
 @cache
@@ -40,7 +40,7 @@ def navigate(
         lumen(device.tip_radius_mm) if walled else None,
         Insertion(np.array([-5.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0] if walled else [0.6, 0.0, 0.8])),
         config=CONFIG,
-        initial=np.column_stack([random.uniform(15, 35, WORLDS), random.uniform(-3, 3, WORLDS)])[worlds],
+        initial=np.column_stack([random.uniform(10, 20, WORLDS), random.uniform(-3, 3, WORLDS)])[worlds],
         control=random.uniform(low, high, (WORLDS, SAMPLES, 2))[worlds] * (1 if walled else 3),
         friction=random.uniform(0.05, 0.2, WORLDS)[worlds],
         actuation=actuation,

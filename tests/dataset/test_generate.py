@@ -71,7 +71,7 @@ def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_da
 
 
 def test_killed_and_resumed_gives_the_same_bits(tmp_path):
-    settings = {"patients": 3, "sequences": 20, "sequences_per_file": 5}
+    settings = {"patients": 2, "sequences": 20, "sequences_per_file": 5}
     make_toy_dataset(tmp_path / "whole", **settings)
     script = (
         f"import sys, time; sys.path[:0] = {sys.path!r}\n"
@@ -82,32 +82,35 @@ def test_killed_and_resumed_gives_the_same_bits(tmp_path):
         "    return toy_simulate(*args, **kwargs)\n"
         f"make_toy_dataset(Path({str(tmp_path / 'killed')!r}), simulate=slowly, **{settings!r})\n"
     )
-    for files_before_the_kill in (1, 4):
-        process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
-        try:
-            deadline = time.monotonic() + 60
-            while len(list((tmp_path / "killed").glob("data/*/file-*.parquet"))) < files_before_the_kill:
-                assert process.poll() is None and time.monotonic() < deadline
-                time.sleep(0.02)
-        finally:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while len(list((tmp_path / "killed").glob("data/*/file-*.parquet"))) < 4:
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
     with pytest.raises(InputError, match="unfinished"):
         read_dataset(tmp_path / "killed")
     (tmp_path / "killed/data/chunk-000/.part-1-file-007.parquet").write_bytes(b"cut off by the kill")
     make_toy_dataset(tmp_path / "killed", **settings)
     assert data_hashes(tmp_path / "killed") == data_hashes(tmp_path / "whole")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "whole").rglob("*")}
+    make_toy_dataset(tmp_path / "whole", **settings)  # finished, it is left alone
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "whole").rglob("*")} == before
+    with pytest.raises(InputError, match=r"no valid episode in split 'calibrate' \(it has seen_test, test, train\)"):
+        read_dataset(tmp_path / "whole").of_split("calibrate")
 
 
-def test_a_finished_dataset_is_left_alone(tmp_path):
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "d").rglob("*")}
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "d").rglob("*")} == before
-
-
-@pytest.mark.parametrize("name", ["data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-000.parquet"])
-@pytest.mark.parametrize("left", ["nothing", "empty", "50 bytes less"])
+@pytest.mark.parametrize(
+    ("name", "left"),
+    [
+        ("data/chunk-000/file-001.parquet", "nothing"),
+        ("data/chunk-000/file-001.parquet", "50 bytes less"),
+        ("meta/episodes/chunk-000/file-000.parquet", "empty"),
+    ],
+)
 def test_a_lost_or_cut_file_is_made_again(tmp_path, name, left):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
     before, file = data_hashes(tmp_path / "d"), tmp_path / "d" / name
@@ -123,8 +126,7 @@ def test_a_lost_or_cut_file_is_made_again(tmp_path, name, left):
     assert data_hashes(tmp_path / "d") == before and file.read_bytes() == content
 
 
-@pytest.mark.parametrize("cut", [None, 50])
-@pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
+@pytest.mark.parametrize(("name", "cut"), [("info.json", None), ("stats.json", 50), ("tasks.parquet", 50)])
 def test_a_lost_or_cut_description_is_made_again(tmp_path, name, cut):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     before = (tmp_path / "d/meta" / name).read_bytes()
@@ -154,14 +156,6 @@ def test_other_settings_are_refused_by_name(tmp_path):
     write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), output=tmp_path / "anatomies/patient-0")
     with pytest.raises(InputError, match=r"anatomies\.patient-0 ="):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-
-
-def test_a_folder_of_other_things_is_refused(tmp_path):
-    (tmp_path / "d").mkdir()
-    (tmp_path / "d/notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"is not empty and holds no run\.json"):
-        make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    assert [path.name for path in (tmp_path / "d").iterdir()] == ["notes.txt"]
 
 
 def test_two_anatomies_of_one_name_are_refused(tmp_path):
@@ -252,9 +246,6 @@ def test_loader_names_what_is_damaged(tmp_path):
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {"settings": older}))
     with pytest.raises(InputError, match=r"made by endopilot 0\.0\.9, format 1, which .* cannot read"):
         read_dataset(tmp_path / "d")
-    (tmp_path / "d/meta/manifest.json").write_text(json.dumps({"key": "0"}))
-    with pytest.raises(InputError, match=r"manifest\.json: settings: missing; make the dataset again"):
-        read_dataset(tmp_path / "d")
     for name, odd in (("settings", None), ("anatomies", "x"), ("files", []), ("key", 3), ("samples_per_episode", None)):
         (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {name: odd}))
         with pytest.raises(InputError, match="; make the dataset again"):
@@ -266,15 +257,3 @@ def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(layout, "__version__", "99.0")
     with pytest.raises(InputError, match=rf"was begun with version = endopilot {__version__}, .*endopilot 99\.0"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-
-
-def test_an_absent_split_is_named(tmp_path):
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    with pytest.raises(InputError, match=r"no valid episode in split 'test' \(it has seen_test, train\)"):
-        read_dataset(tmp_path / "d").of_split("test")
-
-
-def test_importing_needs_no_torch():
-    code = "import sys, endopilot.dataset.generate, endopilot.dataset.loader, endopilot.models.config; "
-    code += "assert not {'torch', 'vtk', 'pyvista', 'matplotlib', 'plotly'} & set(sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

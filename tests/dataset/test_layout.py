@@ -38,51 +38,28 @@ def test_lerobot_reads_a_dataset(toy_dataset):
 NAMES = [f"patient-{i:03d}" for i in range(100)]
 
 
-def test_shares_become_counts():
-    splits = assign_splits(NAMES, 10)
-    by_anatomy = np.where(np.isin(splits, ["train", "seen_test"]), "train", splits)
-    assert {name: int((by_anatomy[:, 0] == name).sum()) for name in ("train", "calibrate", "test")} == {
-        "train": 60,
-        "calibrate": 20,
-        "test": 20,
+@pytest.mark.parametrize("shares", [(0.6, 0.2, 0.2), (2 / 3, 0.0, 1 / 3)])
+def test_patients_are_shared_out_by_the_hash_of_their_names(shares):
+    splits = assign_splits(NAMES, 10, anatomy_shares=shares)
+    assert (assign_splits(NAMES[::-1], 10, anatomy_shares=shares)[::-1] == splits).all()
+    ranked = sorted(range(100), key=lambda k: hashlib.sha256(NAMES[k].encode()).digest())
+    train, rest = np.split(splits[ranked], [round(100 * shares[0])])
+    assert ((train == "seen_test").sum(axis=1) == 2).all() and ((train == "train").sum(axis=1) == 8).all()
+    names, counts = np.unique(rest, return_counts=True)
+    expected = {
+        name: 10 * round(100 * share) for name, share in zip(("calibrate", "test"), shares[1:], strict=True) if share
     }
-    assert (splits == "seen_test").sum() == 60 * 2
+    assert dict(zip(names.tolist(), counts.tolist(), strict=True)) == expected
+    assert all(len(set(row.tolist())) == 1 for row in rest)
 
 
-@pytest.mark.parametrize("shares", [None, (2 / 3, 0.0, 1 / 3), (0.5, 0.5, 0.0)])
-def test_no_anatomy_leaks(shares):
-    splits = assign_splits(NAMES[:13], 20, anatomy_shares=shares)
-    for row in splits:
-        held = set(row.tolist())
-        assert held <= {"train", "seen_test"} or len(held) == 1
-
-
-def test_order_of_the_anatomies_does_not_matter():
-    splits = assign_splits(NAMES, 7)
-    assert (assign_splits(NAMES[::-1], 7)[::-1] == splits).all()
-
-
-def test_the_split_is_that_of_the_hash():
-    first = sorted(NAMES, key=lambda name: hashlib.sha256(name.encode()).digest())[:60]
-    splits = assign_splits(NAMES, 2)
-    trained = {name for name, row in zip(NAMES, splits, strict=True) if row[0] in ("train", "seen_test")}
-    assert trained == set(first)
-
-
-def test_one_patient_is_split_by_sequence():
-    splits = assign_splits(["only"], 10)
-    assert sorted(splits[0].tolist()) == ["seen_test"] * 2 + ["train"] * 8
-
-
-def test_too_few_anatomies_are_refused_with_advice():
+def test_few_patients_and_few_sequences():
+    assert sorted(assign_splits(["only"], 10)[0].tolist()) == ["seen_test"] * 2 + ["train"] * 8
+    assert assign_splits(["only"], 1, seen_test_share=0.0).tolist() == [["train"]]
     with pytest.raises(InputError, match=r"2 anatomies cannot fill 3 splits.*at least 3"):
         assign_splits(NAMES[:2], 5)
-
-
-def test_one_sequence_cannot_be_split():
     with pytest.raises(InputError, match="sequences: 1 cannot be split"):
         assign_splits(NAMES[:1], 1)
-    assert assign_splits(NAMES[:1], 1, seen_test_share=0.0).tolist() == [["train"]]
 
 
 @pytest.fixture(scope="module")
@@ -167,20 +144,12 @@ def test_figures_are_those_of_the_samples(folder):
         for quantile, share in (("p5", 5), ("median", 50), ("p95", 95)):
             assert figures[name][quantile] == pytest.approx(np.percentile(values[valid], share), abs=2e-5), name
     assert figures["branches visited"] == {"1": 1.0}
+    velocity = data.control[valid][:, 0]
+    assert figures["manoeuvres"]["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)
+    assert min(figures["manoeuvres"].values()) > 0
+    assert sum(figures["manoeuvres"].values()) == pytest.approx(1, abs=3e-4)
     assert figures["invalid"] == 6  # the second navigation of each of six files
     assert figures["invalid_reasons"] == {"did not converge": 6}
-
-
-def test_manoeuvres_are_those_that_were_driven(folder):
-    data = read_dataset(folder)
-    velocity = data.control[data.valid][:, 0]
-    shares = describe_dataset(folder).figures["manoeuvres"]
-    assert shares["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)
-    assert shares["retraction"] == pytest.approx((velocity[:, 0] < -0.1).mean(), abs=1e-4)
-    still = np.abs(velocity[:, 0]) <= 0.1
-    assert shares["pause"] == pytest.approx((still & (np.abs(velocity[:, 1]) <= 0.02)).mean(), abs=1e-4)
-    assert min(shares.values()) > 0
-    assert sum(shares.values()) == pytest.approx(1, abs=3e-4)
 
 
 def test_every_distribution_has_a_picture(folder, tmp_path):

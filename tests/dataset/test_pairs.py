@@ -12,14 +12,13 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset, write_episode
 from endopilot.dataset.info import describe_dataset
 from endopilot.dataset.loader import Dataset, read_dataset, read_joined
-from endopilot.dataset.navigations import STOP_SHORT_MM, draw_navigations, simulate_navigations
+from endopilot.dataset.navigations import draw_navigations
 from endopilot.dataset.schema import OF_ROBOT
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.models.episodes import Episodes, check_wire
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.signals import Outputs
 from endopilot.simulation.simulate import simulate
@@ -118,36 +117,6 @@ def test_the_wire_is_driven_as_it_is_without_a_catheter(patient):
     np.testing.assert_array_equal(both.initial[:, :1], alone.initial)
     np.testing.assert_array_equal(both.control[2:], later.control)
     assert np.abs(both.control[:, :, 1:] - alone.control).max() > 1  # independently
-
-
-def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
-    vessel = read_anatomy(patient)
-    leaves = vessel.tree.leaves()
-    ends = np.array([b.centerline.abscissa[-1] if i in leaves else np.inf for i, b in enumerate(vessel.tree.branches)])
-    initial = np.array([[[5.0, 0.0], [90.0, 0.0]], [[5.0, 0.0], [1.5 * ends[np.isfinite(ends)].max(), 1.0]]])
-    control = np.tile([[0.0, 0.0], [12.0, 0.5]], (2, 16, 1, 1))
-    friction = np.tile([0.1, CATHETER.friction], (2, 1))
-    stacks = [Stack(WIRE, (CATHETER,))] * 2
-    driven, stopped = simulate_navigations(vessel, stacks, initial, control, friction, CONFIG.simulator)
-    assert driven.valid.all()
-    assert stopped.all()
-    assert driven.set_up.initial[1, 1, 0] < initial[1, 1, 0]
-    tip = driven.tip[:, :, 1]
-    assert (tip.abscissa < ends[tip.branch] - 0.5 * STOP_SHORT_MM).all()
-    assert tip.abscissa.max() > 60
-    assert driven.command[:, :, 1, 0].min() < 0  # pushed into a dead end, it is pulled back
-    np.testing.assert_array_equal(driven.command[:, :, 0, 0], 0.0)
-
-
-def test_models_take_it_with_the_commands_of_both_devices(pairs):
-    data = read_dataset(pairs)
-    arrays = {each.name: getattr(data, each.name) for each in fields(data)}
-    longer = {name: np.repeat(a, 2, axis=1) for name, a in arrays.items() if np.shape(a)[1:2] == (20,)}
-    episodes = Episodes.of_dataset(replace(data, **longer))
-    np.testing.assert_array_equal(episodes.command, np.repeat(data.command, 2, axis=1))
-    np.testing.assert_array_equal(episodes.start, data.initial)
-    assert episodes.device == Stack(WIRE, (WEAK,))
-    check_wire(pairs, {"device": data.manifest["device"]}, data)
 
 
 def test_what_does_not_go_together_is_refused(pairs, patient, tmp_path):

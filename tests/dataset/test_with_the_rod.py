@@ -16,7 +16,6 @@ from endopilot.dataset.navigations import (
     PULL_BACK_MM,
     STOP_SHORT_MM,
     TIP_GROUP,
-    draw_navigations,
     patient_motion,
     simulate_navigations,
 )
@@ -103,21 +102,6 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     again = simulate(anatomy, DEVICE, applied, initial=started, friction=friction, config=config)
     np.testing.assert_array_equal(again.tip_position, driven.tip_position)
     np.testing.assert_array_equal(again.inserted_length, driven.inserted_length)
-
-
-def test_a_draw_does_not_depend_on_the_others(patient):
-    anatomy = read_anatomy(patient)
-    ranges = {"friction": (0.05, 0.2), "tip_bend_factor": (0.5, 1.5), "tip_stiffness_factor": (0.5, 2.0)}
-    for control in ("velocity", "force"):
-        few = DatasetConfig(sequences=12, seconds=5.0, control=control, **ranges)
-        many = DatasetConfig(sequences=40, seconds=5.0, control=control, **ranges)
-        some = draw_navigations(few, DEVICE, anatomy, range(9, 12))
-        everything = draw_navigations(many, DEVICE, anatomy, range(40))
-        for name, values in vars(some).items():
-            assert np.array_equal(values, vars(everything)[name][9:12]), name
-        assert len(set(everything.tip_bend_rad.tolist())) == 40 // TIP_GROUP
-        assert 0.5 <= everything.tip_bend_rad.min() / DEVICE.tip_bend_rad < 1.5
-        assert len({id(stack) for stack in everything.stacks(Stack(DEVICE))}) == 40 // TIP_GROUP
 
 
 def test_a_dataset_driven_by_force(tmp_path, patient):

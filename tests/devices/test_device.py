@@ -28,10 +28,9 @@ def test_shipped_devices_are_whole(name: str) -> None:
     assert all(len(source) > 10 for source in device.sources.values())
     assert Wire(**asdict(device)) == device
     summary = device.summary()
-    assert summary["ei_tip_n_mm2"] == device.bend_stiffness(np.array([0.0]))[0]
-    assert summary["ei_shaft_n_mm2"] == device.bend_stiffness(np.array([1e3]))[0]
-    assert summary["gj_tip_n_mm2"] == device.twist_stiffness(np.array([0.0]))[0]
-    assert summary["gj_shaft_n_mm2"] == device.twist_stiffness(np.array([1e3]))[0]
+    for name, profile in (("ei", device.bend_stiffness), ("gj", device.twist_stiffness)):
+        ends = [summary[f"{name}_{end}_n_mm2"] for end in ("tip", "shaft")]
+        assert ends == profile(np.array([0.0, 1e3])).tolist()
     if device.tip_load_n is not None:
         assert summary["tip_load_gf"] == pytest.approx(device.tip_load_n / 9.80665e-3, abs=1e-3)
 
@@ -43,22 +42,10 @@ def test_shipped_devices_are_whole(name: str) -> None:
         ("friction:", "frixion:", "frixion: no such field; did you mean friction?"),
         ("  value: 0.1\n", "", "friction.value: missing; add it"),
         ('source: "0.05 hydrophilic to 0.2 bare"', 'source: " "', "friction.source: ' '; give some text"),
-        ('source: "0.05', 'sources: "0.05', "friction.sources: no such field; did you mean source?"),
         ("\n  value: 0.36\n", " 0.36\n# ", "diameter_mm: 0.36; write it as {value: ..., source: ...}"),
         ("length_mm: 3", "length_mm: 0", "tip_bend: length_mm is 0; give a bent tip a positive length"),
-        ("length_mm: 3", "length_cm: 3", "tip_bend.length_cm: no such field; did you mean length_mm?"),
-        ("angle_deg: 45", "angle_deg: 450", "tip_bend.angle_deg: 450; give a number from -360 to 360"),
         ("[0.30, 0.30, 1.2", "[0.30, 1.2", "bend_stiffness_n_mm2: 5 values, but abscissa_mm has 6; give one for each"),
-        (
-            "[0.30, 0.30, 1.2",
-            "[0.30, -0.30, 1.2",
-            "bend_stiffness_n_mm2.value[1]: -0.3; give a number from 0.0001 to 1000000 N·mm²",
-        ),
-        ("[0.23, 0.23, 0.92, 6.2, 23, 62]", "5", "twist_stiffness_n_mm2.value: 5; give a list of values"),
-        ("name: workhorse-014", "name: 14", "name: 14; give text"),
-        ("name: workhorse-014", "name: [", "line 4: not valid YAML"),
         ("[0, 10, 20, 60", "[0, 20, 10, 60", "abscissa_mm: [0.0, 20.0, 10.0, 60.0, 150.0, 300.0]; begin at 0, the tip"),
-        ("name: work", "extra: 1\nname: work", "extra: no such field; the fields are name, diameter_mm, friction"),
     ],
 )
 def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -70,18 +57,6 @@ def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -
         read_wire(path)
     assert str(error.value).startswith(f"{path}: {message}")
     assert "\n" not in str(error.value)
-
-
-def test_a_file_that_is_no_device_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "wire.yaml"
-    path.write_text("- 1\n")
-    with pytest.raises(InputError, match="no mapping of fields"):
-        read_wire(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="no text"):
-        read_wire(path)
-    with pytest.raises(InputError, match="no such device or file"):
-        read_wire(tmp_path)
 
 
 def test_unknown_device_is_refused() -> None:
@@ -152,11 +127,6 @@ def test_without_a_variable_the_folder_is_in_the_user_s_home(folders, tmp_path, 
     assert user_devices() == ("mine",)
 
 
-def test_the_same_folder_named_twice_is_one(folders, monkeypatch):
-    monkeypatch.setenv("ENDOPILOT_DEVICES", str(folders[0] / ".." / "devices"))
-    assert user_devices() == ("mine",) and read_wire("mine").diameter_mm == 0.5
-
-
 @pytest.mark.parametrize("name", ["ours", "workhorse-014"])
 def test_a_name_that_two_files_bear_is_refused(folders, name):
     (folders[0] / f"{name}.yaml").write_text(device_yaml(name)[1], encoding="utf-8")
@@ -183,7 +153,7 @@ def test_the_command_lists_devices_with_their_origin(folders, capsys):
     assert rows["j-035"] == "endopilot" and rows["ours"] == str(folders[1] / "ours.yaml")
 
 
-def test_a_robot_is_written_and_read_back(tmp_path) -> None:
+def test_a_robot_is_written_and_read_back_and_what_a_file_leaves_out_is_assumed(tmp_path) -> None:
     robot = RobotConfig(
         encoders_at="motor",
         jitter_s=0.01,
@@ -193,14 +163,9 @@ def test_a_robot_is_written_and_read_back(tmp_path) -> None:
     )
     robot.write(tmp_path / "robot.yaml")
     assert read_robot(tmp_path / "robot.yaml") == robot
-    assert read_robot(str(tmp_path / "robot.yaml")) == robot
-
-
-def test_what_a_file_leaves_out_is_assumed(tmp_path) -> None:
-    path = tmp_path / "robot.yaml"
+    path = tmp_path / "part.yaml"
     path.write_text("encoders_at: motor\nwire: {play_mm: 2.4}\n", encoding="utf-8")
-    expected = replace(RobotConfig(), encoders_at="motor", wire=replace(DriveConfig(), play_mm=2.4))
-    assert read_robot(path) == expected
+    assert read_robot(str(path)) == RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=2.4))
 
 
 def test_the_robots_of_the_package() -> None:
@@ -222,14 +187,7 @@ def test_the_robots_of_the_package() -> None:
     [
         ("latency_s: 50", r"latency_s: 50; give a number from 0 to 10 s \(50 ms is 0\.05 s\)"),
         ("encoders_at: gears", "encoders_at: 'gears'; choose from 'motor' or 'wire'"),
-        ("wire: {play_mm: -1}", "wire.play_mm: -1; give a number from 0 to 50 mm"),
         ("wire: {play_rad: 324}", r"wire.play_rad: 324; give a number from 0 to 50 rad \(324 ° is 5\.655 rad\)"),
-        ("wire: {gain_translation: 101}", "wire.gain_translation: 101; give a number from 0.5 to 2"),
-        (
-            "wire: {transmission: {length_mm: 9000}}",
-            r"wire.transmission.length_mm: 9000; give a number from 0 to 3000 mm",
-        ),
-        ("wire: {backlash_mm: 1}", "wire.backlash_mm: no such field"),
         ("catheters: []", r"catheters: \[\]; give at least one drive"),
         ("catheters: [{grip_n: 0}]", r"catheters\[0\].grip_n: 0; give a positive number"),
     ],
@@ -239,11 +197,6 @@ def test_a_fault_is_told_in_one_line(tmp_path, text, message) -> None:
     path.write_text(text + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=f"robot.yaml: {message}"):
         read_robot(path)
-
-
-def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
-    with pytest.raises(InputError, match="robot 'corpath': no such robot or file; give a path, or choose from assumed"):
-        read_robot("corpath")
 
 
 def test_a_grip_weakens_a_device_and_never_strengthens_it() -> None:

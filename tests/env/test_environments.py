@@ -40,12 +40,6 @@ def near() -> Navigation:
     return replace(reference_navigation(), target=Target(branch=branch, abscissa=25.0), seconds=3.0)
 
 
-@pytest.fixture(scope="module", params=["wire", "catheter"])
-def either(near, request) -> Navigation:
-    """Return that navigation of a wire alone, and of a microcatheter over the wire."""
-    return near if request.param == "wire" else in_catheter([near], "microcatheter-1.7f")[0]
-
-
 @pytest.mark.parametrize("name", ["Navigate", "NavigateCoaxial"])
 def test_the_registered_environments_pass_gymnasiums_check(name):
     with warnings.catch_warnings():
@@ -155,29 +149,10 @@ def test_an_anatomy_and_a_target_are_an_environment():
         NavigateEnv(anatomy, target="G1.2")
 
 
-def test_a_vector_environment_is_made_by_its_name(near):
-    env = gymnasium.make_vec("endopilot/Navigate-v0", num_envs=WORLDS, navigations=near)
-    assert isinstance(env, NavigateVectorEnv)
-    observations, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observations)
-    observations, rewards, terminations, truncations, infos = env.step(env.action_space.sample())
-    assert env.observation_space.contains(observations)
-    assert rewards.shape == terminations.shape == truncations.shape == (WORLDS,)
-    assert infos["valid"].all() and (infos["contact_force_max"] >= 0).all()
-    assert {f"_{name}" for name in infos if not name.startswith("_")} == {n for n in infos if n.startswith("_")}
-
-
-def test_a_world_that_is_given_no_seed_goes_on_with_its_generator(near):
-    one, other = NavigateVectorEnv(2, navigations=near), NavigateVectorEnv(2, navigations=near)
-    for env in (one, other):
-        env.reset(seed=4)
-    assert np.array_equal(one.reset(seed=[None, None])[0], other.reset()[0])
-
-
-def test_a_single_environment_can_be_pickled_and_restored(either):
-    env = NavigateEnv(navigations=either)
+def test_a_single_environment_can_be_pickled_and_restored(near):
+    env = NavigateEnv(navigations=near)
     env.reset(seed=3)
-    first, second = np.tile([[1.0, 0.2], [0.5, 1.0]], len(either.devices))
+    first, second = np.array([[1.0, 0.2], [0.5, 1.0]])
     env.step(first)
     kept = env.state
     copy = pickle.loads(pickle.dumps(env))
@@ -199,12 +174,6 @@ def test_vessels_move_where_a_motion_is_given_after_the_phase_of_the_ct(near):
     pushed = np.tile([0.6, 0.2], (WORLDS, 1))
     lain, moved = ([each.step(pushed)[0] for _ in range(6)] for each in (still, env))
     assert np.abs(np.subtract(moved, lain)).max() > 0.01
-
-
-def test_a_state_of_another_environment_is_refused(near):
-    other = NavigateVectorEnv(2, navigations=near).state
-    with pytest.raises(InputError, match="state"):
-        NavigateVectorEnv(WORLDS, navigations=near).set_state(other)
 
 
 def test_reward_is_what_the_table_says_and_success_terminates(near):

@@ -14,12 +14,11 @@ from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.env.episodes import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
-from endopilot.env.exposures import TipFinder
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import NavigateVectorEnv, of_world
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.task import in_catheter, reference_navigation
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipFinder
 
 TIP, ABSCISSA, DISTANCE, SLACK = slice(9, 32), 9, 11, 31
 FORWARD, SEEN_FORWARD = np.array([0.5, 0.2, -1.0]), np.array([0.5, 0.2, 1.0])
@@ -61,21 +60,19 @@ def test_an_exposure_shows_the_tip_costs_and_is_kept_until_the_next(ahead):
 @pytest.mark.parametrize("biplane", [True, False])
 def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(ahead, wire, biplane):
     anatomies, config = [ahead.anatomy, reference_navigation().anatomy], FluoroscopeConfig(biplane=biplane)
-    arms = [Fluoroscope(anatomy, wire.tip_radius_mm, config=config) for anatomy in anatomies]
     random, arm = np.random.default_rng(0), np.array([0, 1, 1] * 20)
     lines = [np.concatenate([branch.centerline.points for branch in a.tree.branches]) for a in anatomies]
     tips = np.array([lines[k][random.integers(len(lines[k]))] + random.normal(0, 1.5, 3) for k in arm])
-    headings = random.normal(size=(60, 3))
+    headings, depths = random.normal(size=(60, 3)), random.uniform(0, 60, 60)
     headings /= np.linalg.norm(headings, axis=1, keepdims=True)
-    depths, noise = random.uniform(0, 60, 60), []
-    alone = np.empty((60, 3))
+    noise = np.array([np.random.default_rng(k).standard_normal((1 + biplane, 2)) for k in range(60)])
+    finder = TipFinder([(anatomy, wire.tip_radius_mm) for anatomy in anatomies], config)
+    row, places, *_ = finder.find(arm, tips, headings, depths, noise)
+    likeliest = places[np.unique(row, return_index=True)[1]]
+    arms = [Fluoroscope(anatomy, wire.tip_radius_mm, config=config) for anatomy in anatomies]
     for k, of in enumerate(arm):
-        alone[k] = arms[of].locate(tips[k], headings[k], depths[k], np.random.default_rng(k))
-        noise.append(np.random.default_rng(k).standard_normal((1 + biplane, 2)))
-    finder, some = TipFinder(arms, arm), np.arange(0, 60, 7)
-    np.testing.assert_allclose(finder.locate(np.arange(60), tips, headings, depths, np.array(noise)), alone, atol=1e-9)
-    part = finder.locate(some, tips[some], headings[some], depths[some], np.array(noise)[some])
-    np.testing.assert_allclose(part, alone[some], atol=1e-9)
+        alone = arms[of].measure(tips[k], headings[k], depths[k], np.random.default_rng(k))
+        np.testing.assert_array_equal(alone.position, likeliest[k])
 
 
 def test_the_drives_loads_are_observed_and_nothing_that_no_robot_measures(ahead):

@@ -40,37 +40,6 @@ def test_it_trains(learner, worlds):
     assert all((a == b).all() for a, b in zip(agent.parameters(), again.parameters(), strict=True))
 
 
-def test_what_was_remembered_follows_from_the_rollout_s_begin(learner, worlds):
-    import torch
-
-    torch.manual_seed(0)
-    agent, rollout = learner["Agent"](32, 3), learner["Rollout"](4, 32, 3)
-    player = learner["Player"](worlds, 0)
-    player.play(agent, rollout)
-    player.play(agent, rollout)  # begins with a memory, amid episodes
-    memory = rollout.memory
-    assert memory.abs().max() > 0 and 0 < rollout.begun.sum() < rollout.begun.numel()
-    for observation, begun, value, action, log_prob in zip(
-        rollout.observations, rollout.begun, rollout.values, rollout.actions, rollout.log_prob, strict=True
-    ):
-        memory = agent.remember(observation, memory, begun)
-        chances, again = agent.decide(memory)
-        torch.testing.assert_close(again, value)
-        torch.testing.assert_close(chances.log_prob(action).sum(-1), log_prob)
-    fresh = agent.remember(observation, memory, torch.ones(4))
-    torch.testing.assert_close(fresh, agent.remember(observation, torch.zeros_like(memory), torch.zeros(4)))
-
-
-def test_advantages_are_discounted_errors_that_end_with_an_episode(learner):
-    import torch
-
-    gamma, lam, rollout = learner["GAMMA"], learner["LAMBDA"], learner["Rollout"](1, 32, 3)
-    rollout.rewards[-3:, 0] = torch.tensor([1.0, 2.0, 3.0])
-    rollout.ended[-2] = 1.0
-    found = rollout.advantages(torch.tensor([10.0]))[-3:, 0]
-    torch.testing.assert_close(found, torch.tensor([1.0 + gamma * lam * 2.0, 2.0, 3.0 + gamma * 10.0]))
-
-
 @pytest.mark.parametrize(("name", "looks"), [("state", False), ("xray", True)])
 def test_saved_policies_are_scored_again(learner, ahead, monkeypatch, name, looks):
     """They find a target straight ahead, each in its own way: by the true state, or by exposures that they ask for."""

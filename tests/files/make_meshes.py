@@ -6,6 +6,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import pyvista
 
 SLICER = "3D Slicer output. SPACE={}"
 """What 3D Slicer writes into the header of a mesh, with the axes in place of the braces."""
@@ -17,7 +18,7 @@ def arc() -> np.ndarray:
     return np.column_stack([10 + 30 * np.sin(2 * along), -5 + 20 * along**2, 5 + 60 * along])
 
 
-def tube(axis: np.ndarray, radius: float = 2.0, sides: int = 12) -> tuple[np.ndarray, np.ndarray]:
+def tube(axis: np.ndarray, radius: float | np.ndarray = 2.0, sides: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an open tube around an axis."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
@@ -82,32 +83,13 @@ def _rows(vertices: np.ndarray) -> list[str]:
 
 
 def _write_vtp(path, points, faces, lines, radii, header) -> None:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    data, places = vtkPolyData(), vtkPoints()
-    places.SetData(numpy_to_vtk(np.asarray(points, dtype=float), deep=True))
-    data.SetPoints(places)
-    for setter, sizes in ((data.SetPolys, [3] * len(faces)), (data.SetLines, [len(line) for line in lines])):
-        index = np.asarray(faces).ravel() if setter == data.SetPolys else np.arange(sum(sizes))
-        cells = vtkCellArray()
-        cells.SetData(
-            numpy_to_vtkIdTypeArray(np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), deep=True),
-            numpy_to_vtkIdTypeArray(index.astype(np.int64), deep=True),
-        )
-        setter(cells)
+    starts = np.cumsum([0, *map(len, lines)])
+    cells = [np.append(len(line), start + np.arange(len(line))) for start, line in zip(starts, lines, strict=False)]
+    triangles = np.insert(faces, 0, 3, axis=1).ravel() if len(faces) else None
+    data = pyvista.PolyData(np.asarray(points, float), triangles, lines=np.concatenate(cells) if lines else None)
     if radii is not None:
-        array = numpy_to_vtk(np.concatenate(radii).astype(float), deep=True)
-        array.SetName("MaximumInscribedSphereRadius")
-        data.GetPointData().AddArray(array)
+        data.point_data["MaximumInscribedSphereRadius"] = np.concatenate(radii).astype(float)
     if header:
-        text = vtkStringArray()
-        text.SetName(header.partition("=")[0])
-        text.InsertNextValue(header.partition("=")[2])
-        data.GetFieldData().AddArray(text)
-    writer = vtkXMLPolyDataWriter()
-    writer.SetFileName(str(path))
-    writer.SetInputData(data)
-    writer.Write()
+        name, _, text = header.partition("=")
+        data.field_data[name] = [text]
+    data.save(path)

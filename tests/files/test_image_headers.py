@@ -40,8 +40,8 @@ def test_a_nifti_of_either_byte_order_packed_or_not_whatever_its_suffix(tmp_path
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"magic": (b"ni1\0",)}, "magic .*file of their own"),
-        ({"magic": (b"\0\0\0\0",)}, "magic .*not that of NIfTI"),
+        ({"magic": (b"ni1\0",)}, "magic .*not that of a NIfTI file of its own"),
+        ({"magic": (b"\0\0\0\0",)}, "magic .*not that of a NIfTI"),
         ({"vox_offset": (0,)}, "vox_offset 0"),
         ({"vox_offset": (351,)}, "vox_offset 351"),
         ({"vox_offset": (np.nan,)}, "vox_offset"),
@@ -61,6 +61,8 @@ def test_a_nifti_of_either_byte_order_packed_or_not_whatever_its_suffix(tmp_path
         ({"sform_code": (0,), "qform_code": (1,), "quatern": (2, 0, 0, 0, 0, 0)}, "quatern_b"),
         ({"sform_code": (0,), "qform_code": (1,), "pixdim": (1, -0.4, 0.5, 1.25, 1, 1, 1, 1)}, "pixdim .*-0.4"),
         ({"sform_code": (0,)}, "no orientation"),
+        ({"sform_code": (0,), "qform_code": (1,), "quatern": (np.nan, 0, 0, 0, 0, 0)}, "quatern_b"),
+        ({"srow": (np.nan, 0, 0, 10, 0, 0.5, 0, 20, 0, 0, 1.25, 30)}, "srow_x"),
     ],
 )
 def test_a_nifti_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
@@ -86,13 +88,13 @@ def test_sform_and_qform_that_contradict_each_other(tmp_path):
     _read(nifti(tmp_path / "agree.nii", qform_code=(1,), sform_code=(2,), quatern=quaternion(TURN)))
     for qform, sform, expected in ((2, 1, TURN), (1, 2, np.eye(3)), (1, 4, np.eye(3))):
         path = nifti(tmp_path / f"{qform}{sform}.nii", qform_code=(qform,), sform_code=(sform,), quatern=upright)
-        volume = _read(path, "sform and qform place voxels up to")
+        volume = _read(path, "sform and qform place voxels")
         np.testing.assert_allclose(volume.index_to_world(CORNERS), places(expected), atol=1e-5)
     for code in (1, 2):
         path = nifti(tmp_path / f"{code}.nii", qform_code=(code,), sform_code=(code,), quatern=upright)
         _refused(path, f"qform_code {code} and sform_code {code} do not tell")
     atlas = nifti(tmp_path / "atlas.nii", axes=skewed(0.2), qform_code=(1,), sform_code=(4,), quatern=upright)
-    _read(atlas, "sform is no rigid placement")
+    _read(atlas, "the other form is no rigid placement")
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -137,17 +139,18 @@ def test_the_space_of_an_nrrd(tmp_path, space, signs):
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"space": None}, "no orientation"),
+        ({"space": None}, "no space, which says an orientation in the patient"),
         ({"space": "scanner-xyz"}, "space 'scanner-xyz'"),
         ({"space": "3D-right-handed"}, "space '3D-right-handed'"),
         ({"space": "PLS"}, "space 'PLS'"),
         ({"space_origin": None}, "no space origin"),
         ({"space_origin": "(1,2)"}, "space origin"),
+        ({"space_origin": "(inf,0,0)"}, "space origin holds inf"),
+        ({"space_directions": "(0,0,0) (0,1,0) (0,0,1)"}, "space directions"),
         ({"space_directions": "(1,0,0) (0,1,0)"}, "space directions"),
         ({"space_directions": "(1,0,0) (0,1,0) none"}, "2 axes in space"),
-        ({"space_units": '"mm" "mm" "cm"'}, "space units .*are not mm"),
-        ({"spacings": "1 1 1"}, "spacings 1 1 1 contradict"),
-        ({"sizes": "4 5"}, "dimension and sizes"),
+        ({"space_units": '"mm" "mm" "cm"'}, "space units .*is not mm"),
+        ({"sizes": "4 5"}, "dimension, sizes and space directions"),
         ({"sizes": "4 5 5"}, "more than the 200 bytes"),
         ({"sizes": "4 5 7"}, "incomplete"),
         ({"sizes": "40000 50000 60000"}, "incomplete"),
@@ -191,11 +194,13 @@ def test_voxels_in_several_files_or_in_none_are_refused(tmp_path):
         ({"ElementSpacing": None}, "no ElementSpacing"),
         ({"ElementSpacing": "1 1"}, "ElementSpacing '1 1' is not 3 numbers"),
         ({"ElementSpacing": "a b c"}, "ElementSpacing"),
+        ({"ElementSpacing": "-0.5 1 1"}, "ElementSpacing gives voxels of -0.5"),
+        ({"TransformMatrix": "nan 0 0 0 1 0 0 0 1"}, "TransformMatrix holds nan"),
         ({"TransformMatrix": "1 0 0 1"}, "TransformMatrix .* is not 9 numbers"),
         ({"NDims": 2}, "NDims and DimSize"),
         ({"DimSize": "4 5 7"}, "incomplete"),
         ({"DimSize": "4 5 5"}, "more than the 200 bytes"),
-        ({"ElementNumberOfChannels": 3}, "3 values in every voxel"),
+        ({"ElementNumberOfChannels": 3}, "ElementNumberOfChannels '3' .*grey-level"),
         ({"ElementType": "MET_ASCII_CHAR"}, "ElementType"),
         ({"CompressedData": "maybe"}, "CompressedData 'maybe'"),
         ({"HeaderSize": "-1"}, "HeaderSize"),
@@ -297,26 +302,3 @@ def test_axes_that_are_no_unit_vectors_are_refused(tmp_path):
         read_volume(_dicom_skewed(tmp_path / "two", 2.0 * np.eye(3)))
     (note,) = read_volume(metaimage(tmp_path / "nearly.mha", axes=1.002 * TURN)).notes
     assert "TransformMatrix" in note
-
-
-@pytest.mark.parametrize("bad", ["nan", "inf", "0", "-0.5"])
-def test_numbers_that_are_no_place_are_refused(tmp_path, bad):
-    turned = metaimage(tmp_path / "turned.mha", TransformMatrix=f"{bad} 0 0 0 1 0 0 0 1")
-    flat = np.c_[np.diag([float(bad), 0.5, 1.25]), ORIGIN]
-    sizes = (1, float(bad), 0.5, 1.25, 1, 1, 1, 1)
-    files = {
-        turned: "TransformMatrix",
-        metaimage(tmp_path / "size.mha", ElementSpacing=f"{bad} 1 1"): "ElementSpacing",
-        nifti(tmp_path / "qform.nii", sform_code=(0,), qform_code=(1,), pixdim=sizes): "pixdim",
-    }
-    if bad != "-0.5":  # a negative step is a left-handed grid
-        files[nifti(tmp_path / "sform.nii", srow=tuple(flat.ravel()))] = "srow|affine"
-        files[nrrd(tmp_path / "steps.nrrd", space_directions=f"({bad},0,0) (0,1,0) (0,0,1)")] = "space directions"
-    if bad in ("nan", "inf"):
-        files[nrrd(tmp_path / "origin.nrrd", space_origin=f"({bad},0,0)")] = "space origin"
-        files[metaimage(tmp_path / "origin.mha", Offset=f"{bad} 0 0")] = "Offset"
-        quatern = (float(bad), 0, 0, 0, 0, 0)
-        files[nifti(tmp_path / "q.nii", sform_code=(0,), qform_code=(1,), quatern=quatern)] = "quatern"
-    for path, field in files.items():
-        with pytest.raises(InputError, match=rf"{path.name}: .*({field})"):
-            read_volume(path)

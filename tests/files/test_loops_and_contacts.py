@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from make_meshes import tube
 from make_vessels import hairpin, length_of, line, lumen, thinned_at, tubes, with_voxels
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.tree import sampled
-from endopilot.errors import InputError
 from endopilot.types import Volume
-from endopilot.vessels.coverage import NOTED_MM
 from endopilot.vessels.medial_lines import traced_lines
+from endopilot.vessels.remarks import NOTED_MM
 from endopilot.vessels.surface import Surface, surface_from_mask
-from endopilot.vessels.topology import parted, touch_remarks
+from endopilot.vessels.topology import parted
 
 VOXELS = [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)]
 
@@ -33,92 +33,68 @@ def places_of(anatomy) -> list[np.ndarray]:
     return [np.array(found.split(","), dtype=float) for found in re.findall(r"\(([^()]*)\) mm", notes_of(anatomy))]
 
 
-@pytest.mark.parametrize(("voxel_mm", "across"), zip(VOXELS, (1, 2), strict=True))
-def test_a_hairpin_that_touches_itself_keeps_its_length_and_its_root(voxel_mm, across):
+PARTED, LEFT = "and was parted at", "and was left joined at"
+
+
+@pytest.mark.parametrize("voxel_mm", VOXELS)
+def test_a_hairpin_that_touches_itself_is_parted_and_keeps_its_length_and_its_root(voxel_mm):
     mask = tubes((hairpin(50, 5.0), 1.8), voxel_mm=voxel_mm)
-    for up in np.arange(across) * voxel_mm[2]:
-        for aside in np.arange(across) * voxel_mm[1]:
-            mask = with_voxels(mask, (-1.2, aside, 20 + up), (1.2, aside, 20 + up))
+    for up, aside in np.ndindex(2, 2):
+        place = aside * voxel_mm[1], 20 + up * voxel_mm[2]
+        mask = with_voxels(mask, (-1.2, *place), (1.2, *place))
     anatomy = extract_anatomy(lumen(mask), name="hairpin")
     assert anatomy.insertion.position[2] < 2.0 and len(anatomy.tree.branches) == 1
     assert length_of(anatomy) > 104
-    assert "touches itself and was parted at" in notes_of(anatomy)
+    assert PARTED in notes_of(anatomy)
     assert abs(places_of(anatomy)[0][1]) <= 0.5 and 20.0 <= places_of(anatomy)[0][2] < 30.0
 
 
-def test_the_root_of_a_hairpin_is_its_wide_end_though_the_narrow_end_touches_it():
-    angle = np.linspace(np.pi, 0.0, 60)
-    bend = np.stack([5 + 5 * np.cos(angle), 0 * angle, 50 + 5 * np.sin(angle)], axis=1)
-    limb = (line((0, 0, 0), (0, 0, 50)), 2.0)
-    back = (np.concatenate([bend, line((10, 0, 50), (10, 0, 20), (5.5, 0, 7))]), 1.3)
-    mask = with_voxels(tubes(limb, back), (1.5, 0, 8), (5.0, 0, 8))
-    anatomy = extract_anatomy(lumen(mask), name="hairpin")
-    assert np.linalg.norm(anatomy.insertion.position) < 3.0
-    assert "touches itself and was parted at" in notes_of(anatomy)
-
-
-def test_two_limbs_that_touch_over_their_length_are_parted():
+def test_limbs_that_touch_over_their_length_are_parted():
     mask = tubes((hairpin(50, 3.4), 1.8), voxel_mm=(0.35, 0.35, 0.5))
-    whole, found, *_ = parted(mask)
-    assert whole.voxels.sum() < mask.voxels.sum()
-    assert len(found) == 1 and "touch over" in touch_remarks(found)[0]
+    whole, (touch,), _ = parted(mask)
+    assert whole.voxels.sum() < mask.voxels.sum() and touch.parted and touch.size_mm > 30.0
 
 
-@pytest.mark.parametrize("voxel_mm", VOXELS)
-def test_a_bypass_is_cut_at_its_narrowest_place_and_the_place_is_stated(voxel_mm):
-    bypass = line((0, 0, 10), (10, 0, 20), (10, 0, 40), (0, 0, 50))
-    mask = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (bypass, 1.2), voxel_mm=voxel_mm)
-    anatomy = extract_anatomy(lumen(mask), name="bypass")
-    assert length_of(anatomy) > 95.0
-    assert "a tree holds no loops: cut at" in notes_of(anatomy)
+BYPASS = [(line((0, 0, 0), (0, 0, 60)), 1.8), (line((0, 0, 10), (10, 0, 20), (10, 0, 40), (0, 0, 50)), 1.2)]
+CROSSING = [(line((0, 0, -28), (0, 0, 28)), 1.9), (line((3.0, -20, -20), (3.0, 20, 20)), 1.5)]
 
 
-@pytest.mark.parametrize("voxel_mm", VOXELS)
-def test_two_vessels_that_touch_in_passing_are_parted(voxel_mm):
-    vessels = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (line((4.6, -30, 30), (4.6, 30, 30)), 1.6), voxel_mm=voxel_mm)
+def test_a_bypass_is_cut_at_its_narrowest_place_and_the_place_is_stated():
+    anatomy = extract_anatomy(lumen(tubes(*BYPASS, voxel_mm=VOXELS[1])), name="bypass")
+    assert length_of(anatomy) > 95.0 and PARTED in notes_of(anatomy)
+
+
+def test_two_vessels_that_touch_in_passing_are_parted():
+    vessels = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (line((4.6, -30, 30), (4.6, 30, 30)), 1.6))
     anatomy = extract_anatomy(lumen(with_voxels(vessels, (1.0, 0, 30), (3.6, 0, 30))), name="passing")
-    notes = anatomy.provenance["notes"]
     assert len(anatomy.tree.branches) == 1 and abs(length_of(anatomy) - 60) < 3
-    assert "two vessels touch and were parted at" in notes_of(anatomy) and abs(places_of(anatomy)[0][0] - 2.0) <= 0.5
-    assert any("left out" in note and ("62 mm long" in note or "63 mm long" in note) for note in notes)
+    assert PARTED in notes_of(anatomy) and abs(places_of(anatomy)[0][0] - 2.0) <= 0.5
+    assert re.search(r"another vessel that touches this one left out .* 6[23] mm long", notes_of(anatomy))
 
 
-@pytest.mark.parametrize(("angle", "overlap_mm"), [(25.0, 0.3), (50.0, 0.5), (75.0, 0.8)])
+@pytest.mark.parametrize(("vessels", "place"), [(BYPASS, ()), (CROSSING, (1.7, 0, 0))])
+def test_what_touches_in_a_surface_is_left_joined_and_said(vessels, place):
+    wall = surface_from_mask(tubes(*vessels, voxel_mm=(0.4, 0.4, 0.4)))
+    notes = notes_of(anatomy := extract_anatomy(wall, name="wall"))
+    assert LEFT in notes and PARTED not in notes
+    assert not place or any(np.linalg.norm((found - place)[:2]) < 3.0 for found in places_of(anatomy))
+
+
+@pytest.mark.parametrize(("angle", "overlap_mm"), [(25.0, 0.3), (75.0, 0.8)])
 def test_two_vessels_that_touch_along_their_walls_are_never_one_tree_unsaid(angle, overlap_mm):
     one, turn = line((0, 0, -28), (0, 0, 28)), np.radians(angle)
     other = 24.0 * np.array([0.0, np.sin(turn), np.cos(turn)])
     aside = np.array([1.9 + 1.5 - overlap_mm, 0, 0])
     mask = tubes((one, 1.9), (line(aside - other, aside + other), 1.5), voxel_mm=(0.5, 0.5, 0.5))
     anatomy = extract_anatomy(lumen(mask), name="touching")
-    said = [note for note in anatomy.provenance["notes"] if note.startswith("two vessels")]
-    assert said and any(np.linalg.norm(place - [1.9, 0, 0]) < 3.0 for place in places_of(anatomy))
-    balance = anatomy.provenance["coverage"]
-    assert balance["length_mm"] > 95.0  # of both, as the file holds them
-    assert balance["left_out_mm"] < 5.0 or "another vessel that touches this one left out" in notes_of(anatomy)
+    assert "the lumen touches" in notes_of(anatomy) and any(
+        np.linalg.norm(place - [1.9, 0, 0]) < 3.0 for place in places_of(anatomy)
+    )
+    whole = anatomy.provenance["coverage"]["reached_mm"] > 95.0
+    assert whole or "another vessel that touches this one left out" in notes_of(anatomy)
 
 
-@pytest.mark.parametrize(
-    ("vessels", "said", "place"),
-    [
-        ([(hairpin(50, 3.5), 1.8)], "two vessels may touch", (1.75, 0, 25)),
-        ([(line((0, 0, -28), (0, 0, 28)), 1.9), (line((3.0, -20, -20), (3.0, 20, 20)), 1.5)], "may touch", (1.7, 0, 0)),
-        (
-            [(line((0, 0, 0), (0, 0, 60)), 1.8), (line((0, 0, 10), (10, 0, 20), (10, 0, 40), (0, 0, 50)), 1.2)],
-            "loop",
-            (),
-        ),
-        ([(line((0, 0, 0), (0, 0, 60)), 1.8), (line((0, 0, 20), (15, 0, 45)), 1.4)], "", ()),
-    ],
-)
-def test_what_touches_in_a_surface_is_said_too(vessels, said, place):
-    wall = surface_from_mask(tubes(*vessels, voxel_mm=(0.4, 0.4, 0.4)))
-    notes = notes_of(anatomy := extract_anatomy(wall, name="wall"))
-    assert "parted" not in notes
-    assert said in notes if said else "touch" not in notes and "loop" not in notes
-    assert not place or any(np.linalg.norm((found - place)[:2]) < 3.0 for found in places_of(anatomy))
-
-
-@pytest.mark.parametrize("angles", [(12.0, -12.0), (25.0, -70.0), (40.0, 0.0, -40.0), (20.0, 120.0)])
+@pytest.mark.parametrize("angles", [(12.0, -12.0), (40.0, 0.0, -40.0), (20.0, 120.0)])
 def test_a_fork_keeps_all_its_branches_and_is_not_called_a_contact(angles):
     arms = [(line((0, 0, 0), 30.0 * np.array([np.sin(a), 0.1, np.cos(a)])), 1.3) for a in np.radians(angles)]
     mask = tubes((line((0, 0, -30), (0, 0, 0)), 1.9), *arms, voxel_mm=(0.5, 0.5, 0.5))
@@ -126,7 +102,7 @@ def test_a_fork_keeps_all_its_branches_and_is_not_called_a_contact(angles):
     assert length_of(anatomy) > 0.9 * 30 * (1 + len(angles)) and "touch" not in notes_of(anatomy)
 
 
-def flap(tears: int, at_mm: float = 13.8, end_mm: float = 66.0) -> Volume:
+def flap(tears: int, at_mm: float, end_mm: float) -> Volume:
     """Return a wide vessel along z with a wall one voxel thick inside, open at both its ends and at some tears."""
     z, y, x = np.indices((int(end_mm / 1.2) + 15, 22, 22)) * 1.2
     voxels = (np.hypot(x - 12.6, y - 12.6) < 10.0) & (z > 5) & (z < end_mm + 12)
@@ -136,46 +112,30 @@ def flap(tears: int, at_mm: float = 13.8, end_mm: float = 66.0) -> Volume:
     return Volume(voxels & ~wall, np.full(3, 1.2), np.zeros(3), np.eye(3))
 
 
-@pytest.mark.parametrize("tears", [0, 3])
-def test_a_flap_takes_nothing_away_whatever_its_tears(tears):
-    anatomy = extract_anatomy(lumen(flap(tears)), name="flap")
-    notes = notes_of(anatomy)
-    assert "apart from the lumen" not in notes and "another vessel" not in notes
-    assert any(word in notes for word in ("touches itself", "a wall inside the vessel", "holds no loops"))
-
-
-def test_a_line_goes_through_a_tear_and_not_through_the_flap():
+def test_a_line_goes_through_the_tears_of_a_flap_which_takes_nothing_away():
     anatomy = extract_anatomy(lumen(flap(4, at_mm=15.0, end_mm=114.0)), name="tears")
     narrowest = min(branch.centerline.radius.min() for branch in anatomy.tree.branches)
     assert narrowest > 0.3  # mm; the wall is 1.2 mm thick
+    assert "apart from the lumen" not in notes_of(anatomy) and LEFT in notes_of(anatomy)
 
 
 def test_no_cut_of_a_loop_takes_vessel_away():
     ring = np.stack([9 * np.cos(t := np.linspace(0, 2 * np.pi, 200)), 0 * t, 9 * np.sin(t)], axis=1)
     ways = [(line((0, 0, -40), (0, 0, -9)), 1.7), (ring, 1.2), (line((6, 0, 6), (16, 6, 30)), 1.1)]
     mask = tubes(*ways, (line((-6, 0, 6), (-16, -6, 30)), 1.1), voxel_mm=(0.45, 0.45, 0.5))
-    whole, _, before, after = parted(mask)
+    whole, _, after = parted(mask)
+    before = traced_lines(mask)
     assert label(whole.voxels, np.ones((3, 3, 3)))[1] == 1
     assert abs(after.share_mm.sum() - before.share_mm.sum()) < 0.1 * before.share_mm.sum()
-
-
-def test_what_lies_behind_a_given_ostium_is_stated():
-    mask = tubes((line((0, 0, 0), (0, 0, 60)), 1.6))
-    anatomy = extract_anatomy(lumen(mask), name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 30.0)))
-    assert "of the lumen behind the ostium" in notes_of(anatomy)
 
 
 def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
     pieces = [(line((20.0 * i, 0, 0), (20.0 * i, 0, 60 - 15 * i)), 1.5) for i in range(3)]
     anatomy = extract_anatomy(lumen(tubes(*pieces)), name="pieces")
-    left = [note for note in anatomy.provenance["notes"] if "apart from the lumen left out" in note]
+    left = [note for note in anatomy.provenance["notes"] if "apart from the lumen, which --ostium-mm chooses, left out" in note]
     assert len(left) == 2 and "at (19.0, " in left[0] and "at (39.0, " in left[1]
-
-
-def test_a_mask_of_all_its_voxels_is_refused():
-    full = Volume(np.ones((96, 16, 16), dtype=bool), np.full(3, 0.5), np.zeros(3), np.eye(3))
-    with pytest.raises(InputError, match="every voxel belongs to it"):
-        extract_anatomy(lumen(full), name="full")
+    config = AnatomyConfig(ostium_mm=(0.0, 0.0, 30.0))
+    assert "of the lumen behind the ostium" in notes_of(extract_anatomy(lumen(tubes(*pieces[:1])), config=config))
 
 
 STRAIGHT = line((0, 0, 0), (0, 0, 60))
@@ -193,36 +153,28 @@ def test_a_vessel_goes_on_behind_a_neck(voxel_mm, radius_mm, length_mm, across, 
     mask = thinned_at(tubes((STRAIGHT, radius_mm), voxel_mm=voxel_mm), (0.1, 0.1, 30), length_mm, across)
     anatomy = extract_anatomy(lumen(mask), name="neck")
     assert abs(length_of(anatomy) - 60.0) < 2.0
-    said = any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
-    assert said or not widened
+    assert "a neck of" in notes_of(anatomy) or not widened
 
 
-@pytest.mark.parametrize("voxel_mm", [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)])
-def test_a_branch_of_one_voxel_is_followed(voxel_mm):
-    trunk = tubes((STRAIGHT, 1.6), (line((0, 0, 30), (22, 0, 45)), 0.01), voxel_mm=voxel_mm)
+def test_a_branch_of_one_voxel_is_followed():
+    trunk = tubes((STRAIGHT, 1.6), (line((0, 0, 30), (22, 0, 45)), 0.01), voxel_mm=VOXELS[1])
     anatomy = extract_anatomy(lumen(with_voxels(trunk, (0, 0, 30), (22, 0, 45))), name="twig")
     tips = [anatomy.tree.branches[leaf].centerline.points[-1] for leaf in anatomy.tree.leaves()]
     assert np.linalg.norm(np.array(tips) - [22, 0, 45], axis=1).min() < 2.5
-    assert any("thin branch" in note for note in anatomy.provenance["notes"])
+    assert "a thin branch of" in notes_of(anatomy)
 
 
 def test_what_lies_beyond_a_neck_of_a_surface_is_stated_with_length_and_place():
     height = np.arange(0.0, 60.01, 0.25)
     radius = np.where(np.abs(height - 30) < 1.0, 0.05, 1.6)
-    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
-    rings = np.stack(
-        [np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), height[:, None] + 0 * angle], -1
-    )
-    start = np.arange(24) + 24 * np.arange(len(height) - 1)[:, None]
-    beside = (np.arange(24) + 1) % 24 + 24 * np.arange(len(height) - 1)[:, None]
-    faces = np.concatenate([np.stack([start, beside, beside + 24], -1), np.stack([start, beside + 24, start + 24], -1)])
-    anatomy = extract_anatomy(Surface(rings.reshape(-1, 3), faces.reshape(-1, 3)), name="neck")
+    wall = Surface(*tube(np.outer(height, [0.0, 0.0, 1.0]), radius[:, None, None], sides=24))
+    anatomy = extract_anatomy(wall, name="neck")
     balance = anatomy.provenance["coverage"]
     assert abs(balance["reached_mm"] + balance["left_out_mm"] - balance["length_mm"]) < 0.3
-    assert any("30 mm of the lumen" in note and "not in the tree" in note for note in anatomy.provenance["notes"])
+    assert re.search("30 mm of the lumen .* are not in the tree", notes_of(anatomy))
 
 
-@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(
     st.lists(st.tuples(st.floats(8, 45), st.floats(12, 25), st.floats(0, 6.28), st.floats(0.2, 1.2)), max_size=3),
     st.lists(st.tuples(st.floats(6, 54), st.floats(0.5, 6.0), st.integers(0, 2)), max_size=2),

@@ -90,22 +90,16 @@ def test_other_separators_are_read_and_said(tmp_path, content, said) -> None:
         (['"0,5",2,0'], "row 2: time_s = 0,5 is no finite number"),
         (["0.5,2"], "row 2: rotation_rad_s is empty; give a number"),
         (["0.5,2,0", "1.0,,0"], "row 3: translation_mm_s is empty"),
-        (["0.5,2,0", ",,", "1.0,2,0"], "row 3: time_s is empty"),
-        (["0.5,nan,0"], "row 2: translation_mm_s = nan is no finite number"),
         (["0.5,inf,0"], "row 2: translation_mm_s = inf is no finite number"),
-        (["0.5,1e999,0"], "row 2: translation_mm_s = 1e999 is no finite number"),
         (["0.5,1_0,0"], "row 2: translation_mm_s = 1_0 is no finite number"),
-        (["0.5,#N/A,0"], "row 2: translation_mm_s = #N/A is no finite number"),
         (["0.5,\u0661,0"], "is no finite number"),
         (["00:00:00.5,1,0"], "row 2: time_s = 00:00:00.5 is no finite number"),
         (['0.5,"1,0'], "row 2: no CSV"),
         (["500,1,0", "1000,1,0"], "row 2: time_s = 500 seems to be in ms (500 ms is 0.5 s); give seconds"),
-        (["20,1,0", "40,1,0"], "20 ms is 0.02 s"),
         (["0.0001,1,0"], "row 2: time_s = 0.0001; give seconds; a period has 0.001 to 4"),
         (["1.7e9,1,0", "1700000000.5,1,0"], "row 2: time_s = 1700000000; give seconds"),
         (["0,1,0", "0.5,1,0"], "row 2: time_s = 0; the first row ends the first period"),
         (["0.5,1,0", "0.5,1,0"], "row 3: time_s = 0.5; each world's rows end periods of one length"),
-        (["1.0,1,0", "0.5,1,0"], "row 3: time_s = 0.5; each world's rows end periods of one length"),
         ([], "has no rows below the names"),
     ],
 )  # fmt: skip
@@ -113,23 +107,17 @@ def test_a_row_that_is_none_is_refused_by_its_line_and_column(tmp_path, rows, wh
     assert what in refused(tmp_path, "\n".join([HEADER, *rows]) + "\n")
 
 
-def test_semicolons_with_commas_and_points_are_ambiguous(tmp_path) -> None:
-    content = PLAIN.replace(",", ";").replace("0.25", "0,25")
-    assert "holds decimal commas and decimal points" in refused(tmp_path, content)
-
-
 @pytest.mark.parametrize(
     ("content", "what"),
     [
+        (PLAIN.replace(",", ";").replace("0.25", "0,25"), "holds decimal commas and decimal points"),
         ("", "is empty; give the columns time_s, translation_mm_s, rotation_rad_s"),
-        ("\n \n", "is empty"),
         ("0.5,2,0\n1.0,2,0\n", "row 1 holds numbers; give the columns' names there"),
         (PLAIN.replace("rotation_rad_s", "rotation_deg_s"), "rotation_rad_s is missing (rotation_deg_s is there)"),
         (PLAIN.replace("rotation_rad_s", "time_s"), "column rotation_rad_s is missing"),
         (PLAIN.replace("\n", ",1\n").replace("rad_s,1", "rad_s,Time_s"), "column time_s stands there 2 times"),
         (PLAIN.replace("\n", ",1\n").replace("rad_s,1", "rad_s,worlds"), "worlds is not known; did you mean world?"),
         (b"\x89PNG\r\n\x1a\n\x00\x00", "is no text"),
-        (b"PK\x03\x04\x14\x00\x06\x00", "is no text"),
         (PLAIN.replace("time_s", "Zeit in µs, time_s").encode("latin-1"), "is no text in UTF-8"),
         (PLAIN.encode("utf-16-le"), "is no text (it holds zero bytes)"),
         ("time_s," + "x" * 200_000 + "\n", "no CSV (field larger than field limit"),
@@ -189,7 +177,7 @@ def test_desired_tips_are_read_by_the_same_rules(tmp_path) -> None:
         read_tips(path, 40.0, 2.0)
 
 
-BOUNDED = bounded(80)
+BOUNDED = bounded(50)
 NAMES = ["time_s", "translation_mm_s", "rotation_rad_s", "world", "inserted_length_mm", "rotation_rad", "branch", ""]
 NUMBERS = st.floats(-50, 50).map(lambda value: round(value, 3))
 ODD = ["0.5", "1.0", "1.5", "0", "", "nan", "1e400", "0,5", '"', "x", " 2 ", "1_0", "#N/A"]
@@ -231,24 +219,3 @@ def test_any_cells(tmp_path, header, rows, separator, end, devices) -> None:
 @given(content=st.binary(max_size=80) | st.text(max_size=80))
 def test_any_bytes(tmp_path, content) -> None:
     assert outcome(tmp_path / "c.csv", content) is None
-
-
-@BOUNDED
-@given(
-    rows=st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=6),
-    period=st.sampled_from([0.05, 0.5, 1.0]),
-    separator=st.sampled_from(",;\t|"),
-    comma=st.booleans(),
-    order=st.permutations(range(3)),
-    encoding=st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]),
-)
-def test_a_table_is_read_the_same_however_it_is_written(
-    tmp_path, rows, period, separator, comma, order, encoding
-) -> None:
-    table = [NAMES[:3], *([f"{period * (k + 1):.3f}", *map(str, row)] for k, row in enumerate(rows))]
-    text = "\n".join(separator.join(row[place] for place in order) for row in table)
-    if comma and separator != ",":
-        text = text.replace(".", ",")
-    found = outcome(tmp_path / "c.csv", text.encode(encoding))
-    assert found is not None and abs(found.period_s - period) < 1e-12
-    np.testing.assert_array_equal(found.control[0, :, 0], rows)

@@ -41,9 +41,13 @@ def arch():
     return scan(grid, hu, blur_mm=0.7), aorta
 
 
-def test_the_arch_is_found_and_leaks_and_branches_are_cut(arch):
-    volume, aorta = arch
-    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
+@pytest.fixture(scope="module")
+def lumen(arch):
+    return segment(arch[0], config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
+
+
+def test_the_arch_is_found_and_leaks_and_branches_are_cut(arch, lumen):
+    (volume, aorta), mask = arch, lumen
     between = positions(volume)[..., 2] > -36.0
     assert dice(mask.volume.voxels & between, aorta & between) > 0.93
     far = np.linalg.norm(positions(volume) - [0.0, -22.0, -25.0], axis=-1) < 18.0
@@ -55,7 +59,7 @@ def test_the_arch_is_found_and_leaks_and_branches_are_cut(arch):
     assert not (mask.volume.voxels & (positions(volume)[..., 2] < -46.0)).any()
 
 
-def test_the_mask_lies_on_the_grid_of_any_orientation(arch):
+def test_the_mask_lies_on_the_grid_of_any_orientation(arch, lumen):
     volume, _ = arch
     turned = Volume(
         np.ascontiguousarray(volume.voxels.transpose(2, 0, 1)[:, ::-1]),
@@ -63,10 +67,9 @@ def test_the_mask_lies_on_the_grid_of_any_orientation(arch):
         volume.index_to_world(np.array([0.0, 0.0, volume.voxels.shape[0] - 1])),
         volume.direction[:, [1, 2, 0]] * [1, -1, 1],
     )
-    straight = segment(volume, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
     again = segment(turned, config=SegmentConfig(method="aorta", seeds=(DESCENDING, ASCENDING)))
     back = again.volume.voxels[:, ::-1].transpose(1, 2, 0)
-    assert dice(back, straight.volume.voxels) > 0.99
+    assert dice(back, lumen.volume.voxels) > 0.99
 
 
 def test_seeds_that_cannot_be_used_are_refused(arch):
@@ -91,16 +94,6 @@ def test_seeds_in_separate_vessels_are_refused():
         segment(scan(grid, hu), config=SegmentConfig(method="aorta", seeds=((20.0, 30.0, 10.0), (60.0, 30.0, 10.0))))
 
 
-def test_one_seed_follows_a_plain_vessel_to_its_far_end():
-    grid = empty_grid((40, 30, 30), 2.0, (0.0, 0.0, 0.0))
-    line = np.linspace(6, 70, 200)[:, None] * [0.0, 0.0, 1.0] + [30.0, 28.0, 0.0]
-    tube = inside_tube(grid, line, 9.0)
-    volume = scan(grid, np.where(tube, BLOOD_HU, 40.0))
-    mask = segment(volume, config=SegmentConfig(method="aorta", seeds=((30.0, 28.0, 8.0),)))
-    between = (positions(volume)[..., 2] > 14.0) & (positions(volume)[..., 2] < 68.0)
-    assert dice(mask.volume.voxels & between, tube & between) > 0.93
-
-
 @pytest.mark.skipif(not _SAMPLE.exists(), reason="the real thoracic CTA is not here (endopilot sample cta-thorax)")
 def test_the_real_aorta_agrees_with_the_network_s_mask():
     """The network also marks the false lumen where no contrast reaches it, which is cut off here."""
@@ -121,7 +114,7 @@ def thorax() -> Volume:
     return read_volume(_SAMPLE / "cta_thorax_1p5mm.nii.gz")
 
 
-@pytest.mark.parametrize("noise_hu", [0.0, 40.0])
+@pytest.mark.parametrize("noise_hu", [40.0])
 def test_blood_is_distinguished_from_bone(thorax, noise_hu):
     """The whole thorax holds contrast; a box around ten vertebrae, in front of which the aorta is cut off, does not."""
     noise = np.random.default_rng(0).normal(0.0, noise_hu, thorax.voxels.shape)
@@ -135,7 +128,7 @@ def test_blood_is_distinguished_from_bone(thorax, noise_hu):
         refuse_without_contrast(spine)
 
 
-@pytest.mark.parametrize("thickness_mm", [4.0, 8.0, 16.0])
+@pytest.mark.parametrize("thickness_mm", [4.0, 16.0])
 def test_a_thin_slab_of_an_aorta_holds_contrast(thickness_mm):
     """Its cross-section of 7 cm² is that of any pool; its volume is what the slab leaves of it."""
     shape = (round(thickness_mm / 0.5), 160, 160)
@@ -158,7 +151,7 @@ def test_a_thin_slab_of_an_aorta_holds_contrast(thickness_mm):
 AORTA_MM, ARTERY_MM, LENGTH_MM = 14.0, 2.8, 20.0
 
 
-@pytest.mark.parametrize("slant_deg", [0.0, 40.0, 60.0])
+@pytest.mark.parametrize("slant_deg", [0.0, 60.0])
 def test_the_ostium_lies_on_the_aortas_wall_and_on_the_arterys_axis(slant_deg):
     grid = empty_grid((110, 90, 130), (0.5, 0.5, 0.5), (-33.0, -22.0, -25.0))
     place = positions(grid)

@@ -89,23 +89,23 @@ def test_the_left_tree_is_another_one(heart):
 def test_an_artery_beside_a_chamber_is_not_taken_for_a_part_of_it():
     """A Gaussian of 1 mm closes the fat between them, and another vessel, 36 mm away, is taken for the right artery."""
     patient = make_patient(AtlasConfig(vessel="rca", seed=0, population="textbook"), 0)
-    ct = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
+    whole = make_phantom(patient, config=PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), seed=0)
+    index = whole.world_to_index(patient.tree.line.points)
+    low = np.maximum(index.min(axis=0) - 40, 0).astype(int)
+    high = index.max(axis=0).astype(int) + 40
+    box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+    ct = replace(whole, voxels=whole.voxels[box], origin_mm=whole.index_to_world(low.astype(float)))
     found = segment(ct, config=SegmentConfig(method="coronary", vessel="rca"))
     assert np.linalg.norm(found.ostium.position - patient.insertion.position) < 0.5
 
 
-def test_seeds_choose_the_vessel(heart, right_tree):
-    by_seed = segment(heart[0], config=SegmentConfig(vessel="lca", seeds=(tuple(_axis()[20]), tuple(_branch()[-4]))))
-    assert dice(by_seed.volume.voxels, right_tree.volume.voxels) > 0.9
-
-
-def test_a_volume_cut_off_at_zero_is_segmented_with_seeds_and_one_that_lost_its_rescale_is_not(heart):
+def test_a_volume_cut_off_at_zero_is_segmented_with_seeds_and_one_that_lost_its_rescale_is_not(heart, right_tree):
     cut = replace(heart[0], voxels=np.maximum(heart[0].voxels, 0))
     with pytest.raises(InputError, match="give seeds if it was cut off at 0"):
         segment(cut, config=SegmentConfig())
-    seeds = (tuple(_axis()[0]), tuple(_axis()[-6]))
-    whole, found = (segment(volume, config=SegmentConfig(seeds=seeds)).volume.voxels for volume in (heart[0], cut))
-    assert 2 * (whole & found).sum() / (whole.sum() + found.sum()) > 0.9
+    seeds = (tuple(_axis()[20]), tuple(_branch()[-4]))
+    found = segment(cut, config=SegmentConfig(vessel="lca", seeds=seeds)).volume.voxels  # seeds choose the vessel
+    assert dice(found, right_tree.volume.voxels) > 0.85
     lost = replace(heart[0], voxels=heart[0].voxels + 1024 - min(int(heart[0].voxels.min()), 0))
     with pytest.raises(InputError, match="as at the seeds: the rescale is lost"):
         segment(lost, config=SegmentConfig(seeds=seeds))
@@ -121,11 +121,10 @@ def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):
     assert dice(lower.volume.voxels & inside, right_tree.volume.voxels[:70] & inside) > 0.85
 
 
-@pytest.mark.parametrize("seeds", [(), ((0.0, 0.0, 0.0),)])
-def test_voxels_too_coarse_for_coronary_arteries_are_refused_with_their_size(heart, seeds):
+def test_voxels_too_coarse_for_coronary_arteries_are_refused_with_their_size(heart):
     thick = Volume(heart[0].voxels[::3], heart[0].spacing_mm * [1.0, 1.0, 3.0], heart[0].origin_mm, heart[0].direction)
     with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.8 mm; 1.25 mm at most\)"):
-        segment(thick, config=SegmentConfig(seeds=seeds))
+        segment(thick, config=SegmentConfig(seeds=((0.0, 0.0, 0.0),)))
 
 
 def test_a_volume_without_aorta_is_refused():

@@ -8,8 +8,8 @@ import pytest
 from scipy import ndimage
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
-from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.overlay_picture import draw_overlay
+from endopilot.imaging.vessel_tracking import lumen_at_half_height
 from endopilot.imaging.voxels import dilated
 from endopilot.types import LumenMask, Volume
 
@@ -44,9 +44,8 @@ def lumen_of(plaque_hu: float | None, seed: int = 0, noise_hu: float = 20.0):
     return found, lumen, np.hypot(x[..., 0], x[..., 1])
 
 
-@pytest.mark.parametrize("noise_hu", [10.0, 40.0])
-def test_the_wall_of_a_tube_in_fat(noise_hu):
-    found, lumen, _ = lumen_of(None, noise_hu=noise_hu)
+def test_the_wall_of_a_tube_in_fat():
+    found, lumen, _ = lumen_of(None, noise_hu=40.0)
     assert dice(found, lumen) > 0.93
 
 

@@ -11,8 +11,7 @@ import pytest
 from shapes import BLOOD_HU, empty_grid, positions
 
 from endopilot.errors import InputError
-from endopilot.imaging import segment as segmentation
-from endopilot.imaging.segment import METHODS, SegmentConfig, segment
+from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.types import Volume
 
 _METHOD = """
@@ -77,11 +76,6 @@ def _ball(radius_mm: float = 16.0) -> Volume:
     return Volume(np.where(inside, BLOOD_HU, -90.0), grid.spacing_mm, grid.origin_mm, grid.direction)
 
 
-def test_every_shipped_method_is_found_by_its_name():
-    assert METHODS.names() == ("aorta", "coronary", "nnunet", "totalsegmentator")
-    assert all(callable(segmentation._method(name).segment_lumen) for name in METHODS.names())
-
-
 def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method):
     mask = segment(_ball(), config=SegmentConfig(method=PLAIN))
     assert mask.method == PLAIN
@@ -136,38 +130,11 @@ def test_a_bad_configuration_is_refused(plain_method, values, expected):
         SegmentConfig(**values)
 
 
-@pytest.mark.parametrize("method", ["aorta", "coronary"])
-def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent(method):
+def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent():
     grid = empty_grid((10, 20, 30), (1.0, 2.0, 3.0), (-5.0, 0.0, 100.0))
     grid.voxels[:] = -50
     with pytest.raises(InputError, match=r"outside the volume.*x -5…24, y 0…38, z 100…127"):
-        segment(grid, config=SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
-
-
-def test_a_lost_rescale_is_refused(plain_method):
-    ball = _ball()
-    raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
-    with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
-        segment(raw, config=SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
-
-
-def test_contrast_is_found_by_the_histogram(plain_method):
-    """Muscle at 50 HU with bone: a shell of 3 mm and noise fill no millilitre of homogeneous bright tissue."""
-    grid = empty_grid((50, 60, 60), 1.0, (0.0, 0.0, 0.0))
-    radius = np.linalg.norm(positions(grid) - [30.0, 30.0, 25.0], axis=-1)
-    hu = np.where(radius < 22.0, 50.0, -90.0)
-    hu[(radius > 17.0) & (radius < 20.0)] = 600.0
-    noise = np.random.default_rng(0).normal(0.0, 25.0, hu.shape)
-    config = SegmentConfig(method=PLAIN)
-    unenhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
-    with pytest.raises(InputError, match=r"no contrast: homogeneous soft tissue peaks at (45|55) HU, .*has 0.\d ml"):
-        segment(unenhanced, config=config)
-    seeded = segment(unenhanced, config=SegmentConfig(method=PLAIN, seeds=((30.0, 30.0, 25.0),)))
-    assert seeded.volume.voxels.any()  # a seed says where blood is
-    hu[radius < 15.0] = 200.0
-    enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
-    with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner
-        segment(enhanced, config=config)
+        segment(grid, config=SegmentConfig(seeds=((0.0, 50.0, 110.0),)))
 
 
 _TOTALSEGMENTATOR = """
@@ -259,18 +226,17 @@ def test_another_task_and_device_are_passed_on_and_the_first_seed_is_the_ostium(
 def test_nnunet_is_run_with_all_folds_in_the_model_s_own_format(program, ct, tmp_path):
     program("nnUNetv2_predict_from_modelfolder", _NNUNET)
     model = f"model={_model(tmp_path / 'model')}"
-    with pytest.raises(InputError, match=r"marked 2 labels \(1, 2\); choose one"):
+    with pytest.raises(InputError, match=r"not taken: the mask holds 2 labels \(1, 2\); choose one"):
         segment(ct, config=SegmentConfig(method="nnunet", options=(model,)))
     mask = segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=2")))
     np.testing.assert_array_equal(mask.volume.voxels, ct.voxels > 300)
-    with pytest.raises(InputError, match="no voxel with label 3"):
+    with pytest.raises(InputError, match="no voxel has label 3"):
         segment(ct, config=SegmentConfig(method="nnunet", options=(model, "label=3")))
 
 
-@pytest.mark.parametrize("options", [(), ("model=/nowhere",)])
-def test_nnunet_without_a_model_is_refused(ct, options):
+def test_nnunet_without_a_model_is_refused(ct):
     with pytest.raises(InputError, match=r"holds no trained nnU-Net; give --options model=FOLDER"):
-        segment(ct, config=SegmentConfig(method="nnunet", options=options))
+        segment(ct, config=SegmentConfig(method="nnunet", options=("model=/nowhere",)))
 
 
 @pytest.mark.parametrize(
@@ -282,10 +248,10 @@ def test_nnunet_without_a_model_is_refused(ct, options):
             "exit code 1: ERROR: no licence; install",
         ),
         ("print('done')", r"wrote no coronary_arteries.nii.gz \(it wrote nothing\)"),
-        (_TOTALSEGMENTATOR.format(device="gpu", above=3000), "found no lumen in this CT"),
+        (_TOTALSEGMENTATOR.format(device="gpu", above=3000), "not taken: the mask is empty"),
         (
             "import sys; open(sys.argv[4] + '/coronary_arteries.nii.gz', 'w').write('x')",
-            "is no volume; install",
+            r"is not taken: .*, or install",
         ),
     ],
     ids=["missing", "fails", "writes nothing", "finds nothing", "writes rubbish"],
@@ -298,8 +264,8 @@ def test_a_program_that_does_not_answer_is_reported_in_one_line(program, ct, tex
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("factor", [1.15, 0.9])
-def test_an_answer_with_other_voxels_of_the_same_number_is_put_where_it_lies(program, ct, factor):
+def test_an_answer_with_other_voxels_of_the_same_number_is_put_where_it_lies(program, ct):
+    factor = 1.15
     change = f"(1, mask.GetOrigin(), [{factor} * step for step in mask.GetSpacing()], mask.GetDirection())"
     text = _TOTALSEGMENTATOR.format(device="gpu", above=200)
     text = text.replace(
@@ -320,12 +286,3 @@ def test_an_answer_beside_the_ct_is_refused(program, ct):
     program("TotalSegmentator", text)
     with pytest.raises(InputError, match="TotalSegmentator wrote a mask that lies outside the CT"):
         segment(ct, config=SegmentConfig(method="totalsegmentator"))
-
-
-def test_the_program_gets_nothing_but_geometry_and_hu(program, ct, tmp_path):
-    program("TotalSegmentator", f"import shutil, sys; shutil.copy(sys.argv[2], {str(tmp_path / 'got.nii.gz')!r})")
-    with pytest.raises(InputError, match="wrote nothing"):
-        segment(ct, config=SegmentConfig(method="totalsegmentator"))
-    from endopilot.imaging.volume import read_volume
-
-    np.testing.assert_array_equal(read_volume(tmp_path / "got.nii.gz").voxels, ct.voxels)

@@ -34,10 +34,6 @@ def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     names = set(dataset.anatomy.tolist())
     assert names == set(episodes.anatomies)
     assert all(episodes.anatomies[name]().name == name for name in names)
-
-
-def test_chosen_episodes_share_the_vessels(dataset):
-    episodes = Episodes.of_dataset(dataset)
     some = episodes.select(np.array([3, 1]))
     assert some.anatomies is episodes.anatomies and some.anatomy.tolist() == [episodes.anatomy[3], episodes.anatomy[1]]
     np.testing.assert_array_equal(some.tip, episodes.tip[[3, 1]])

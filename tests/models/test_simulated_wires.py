@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.anatomy.io import write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import read_dataset
@@ -18,30 +16,24 @@ from endopilot.models.checkpoint import load_model
 from endopilot.models.episodes import Episodes
 from endopilot.models.hypotheses import HYPOTHESES, Family
 from endopilot.models.simulated_wires import SimulatedWires, weighted_median, weights
+from endopilot.simulation.config import PRESETS
 
 LATER = slice(30, None)
 OSTIUM_MM = 0.3
 
 
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wires") / "anatomy"
-    write_anatomy(make_patient(AtlasConfig(seed=77), 0), output=folder)
-    return folder
-
-
-def navigations(patient, folder, **settings) -> Episodes:
+def navigations(vessel, folder, **settings) -> Episodes:
     device = settings.pop("device", read_wire("workhorse-014"))
-    config = DatasetConfig(seconds=22.5, **settings)
-    generate_dataset([patient], output=folder, device=device, config=config)
+    config = DatasetConfig(seconds=20.0, seen_test_share=0.0, simulator=PRESETS["fast"], **settings)
+    generate_dataset([vessel], output=folder, device=device, config=config)
     return Episodes.of_dataset(read_dataset(folder))
 
 
 @pytest.fixture(scope="module")
-def episodes(patient, tmp_path_factory):
+def episodes(vessel, tmp_path_factory):
     """Return navigations with more friction than is given, and an ostium 0.3 mm deeper."""
     folder = tmp_path_factory.mktemp("wires") / "dataset"
-    true = navigations(patient, folder, sequences=4, friction=(0.114, 0.12), seed=3)
+    true = navigations(vessel, folder, sequences=3, friction=(0.114, 0.12), seed=3)
     error = np.array([OSTIUM_MM, 0.0], dtype=true.proximal.dtype)
     return replace(true, start=true.start - error, proximal=true.proximal - error)
 
@@ -63,21 +55,22 @@ def test_identified_from_the_given_tips_they_predict_the_others(episodes):
     np.testing.assert_array_equal(SimulatedWires().rollout_forward(blind).tip[0], found[1])
 
 
-def test_in_a_patient_who_moves_wires_move_as_far_as_is_known(patient, tmp_path):
-    moving = navigations(patient, tmp_path / "moving", sequences=2, seed=4, motion="both")
+def test_in_a_patient_who_moves_wires_move_as_far_as_is_known(vessel, tmp_path):
+    moving = navigations(vessel, tmp_path / "moving", sequences=1, seed=4, motion="both")
     blind = replace(moving, known_motions={})
     fitted, unaware = (error_mm(SimulatedWires().rollout_forward(each).tip, moving).mean() for each in (moving, blind))
     assert fitted < 0.5 * unaware, (fitted, unaware)
 
 
-def test_a_wire_in_a_catheter_is_predicted_and_led_too(patient, tmp_path):
+def test_a_wire_in_a_catheter_is_predicted_and_led_too(vessel, tmp_path):
     pair = Stack.of("workhorse-014", "microcatheter-1.7f")
-    both = navigations(patient, tmp_path / "pairs", device=pair, sequences=2, seed=5, friction=(0.115, 0.12))
-    assert both.start.shape == (2, 2, 2) and both.command.shape == (2, 45, 2, 2)
+    both = navigations(vessel, tmp_path / "pairs", device=pair, sequences=1, seed=5, friction=(0.115, 0.12))
+    assert both.start.shape == (1, 2, 2) and both.command.shape == (1, 40, 2, 2)
     wires = SimulatedWires()
     assert np.median(error_mm(wires.rollout_forward(both).tip, both)) < 0.2
     still = replace(both, command=both.command * np.array([[1.0], [0.0]]))  # the catheter stays
-    assert np.abs(wires.rollout_forward(still).tip - both.tip[:, LATER]).max() > 0.5
+    wires.identified[still] = wires.identified[both]  # of the same wires
+    assert np.abs(wires.rollout_forward(still).tip - both.tip[:, LATER]).max() > 0.3
     assert np.median(error_mm(wires.rollout_dual(both).tip, both)) < 0.5
 
 

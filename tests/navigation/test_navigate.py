@@ -115,7 +115,7 @@ def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
         assert record.reason != "invalid"
 
 
-@pytest.mark.parametrize("devices", [5.0, (5.0, 0.0), ((5.0,),), ((1.0, 2.0, 3.0),), None])
+@pytest.mark.parametrize("devices", [5.0, ((5.0,),), None])
 def test_what_is_no_pair_for_each_device_is_refused_in_a_line(straight, devices) -> None:
     class Odd(Forward):
         def decide(self, observation: Observation) -> Decision:
@@ -221,18 +221,6 @@ def test_hands_take_over_and_hand_back(straight) -> None:
     assert record.believed is None and record.half_width is None
 
 
-def test_images_show_the_tip(straight) -> None:
-    """In a patient who lies in a pose of their own: as far along as the tip is, and how sure that is."""
-    policy = Forward(8.0, expose_every=4)
-    record = NavigationLoop(straight, policy, config=LoopConfig(xray="images"), seed=2).run()
-    assert policy.navigation.xray == "images" and straight.xray == "assumed"
-    assert record.reason == "reached" and record.exposures >= 2
-    for sample in np.flatnonzero(record.exposed):
-        shown = record.measured[sample]
-        assert shown is not None and min(shown.tip_sd_mm) > 0
-        assert abs(shown.abscissa - record.tip.abscissa[sample, 0]) < 1.5
-
-
 def test_an_image_without_a_wire_is_taken_again_and_counts(straight, monkeypatch) -> None:
     loop = NavigationLoop(straight, Forward(4.0))
     blind = iter([True, True, False])
@@ -280,6 +268,7 @@ def test_images_show_a_moving_vessel_where_it_is_less_what_is_known(straight) ->
     known = replace(straight, known_motion=breathing(breathing_caudal_mm=5.0))
     config = LoopConfig(robot=PERFECT, xray="images", motion=breathing())
     record = NavigationLoop(replace(known, seconds=4.0), Forward(6.0, expose_every=2), config=config, seed=2).run()
+    assert all(min(tip.tip_sd_mm) > 0 for tip in record.measured if tip is not None)
     at = np.flatnonzero([tip is not None and k >= 2 for k, tip in enumerate(record.measured)])
     assert len(at) >= 3
     seen = np.array([record.measured[k].position[2] for k in at])

@@ -8,16 +8,11 @@ import numpy as np
 import pytest
 
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.errors import InputError
-from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
-from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
-from endopilot.navigation.loop import LoopConfig, NavigationLoop, start_world
+from endopilot.navigation.baseline_policies import LEAD_MM, CatheterAlone
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation
-from endopilot.robot.robot import SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 COARSE = LoopConfig(simulator=SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1))
@@ -39,32 +34,6 @@ def over_the_wire(fork, wire, catheter) -> Navigation:
         arrives="catheter",
         seconds=30.0,
     )
-
-
-def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> None:
-    simulator = start_world(over_the_wire, World(), COARSE.simulator)
-    limits = [DriveLimits.of(device, over_the_wire.anatomy) for device in over_the_wire.devices]
-    drive = DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, play_mm=0.0, play_rad=0.0)
-    noiseless = RobotConfig(wire=drive, catheters=(drive,))
-    robot = SimulatedRobot(simulator, limits, noiseless)
-    robot.command(((4.0, 0.0), (2.0, 0.5)))
-    robot.run(2.0)
-    state = robot.proximal_state()
-    # v (t - latency) less v²/2a of the ramp
-    assert state.devices[0] == pytest.approx((2.0 + 4.0 * 1.95 - 4.0**2 / 400.0, 0.0), abs=1e-6)
-    assert state.devices[1] == pytest.approx((2.0 * 1.95 - 2.0**2 / 400.0, 0.5 * 1.95 - 0.5**2 / 120.0), abs=1e-6)
-    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [2.0, 0.5]]))
-    robot.command(((4.0, 0.0),))  # a catheter that is not named stops
-    robot.run(1.0)
-    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [0.0, 0.0]]))
-    robot.stop()
-    robot.run(0.5)
-    before = robot.proximal_state()
-    robot.run(0.5)
-    assert robot.proximal_state().devices[1] == before.devices[1]
-    noisy = SimulatedRobot(simulator, limits, RobotConfig(), seed=1).proximal_state()
-    errors = [now[0] - then[0] for now, then in zip(noisy.devices, before.devices, strict=True)]
-    assert errors[0] != errors[1] and 0 < max(map(abs, errors)) < 0.2
 
 
 def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(over_the_wire) -> None:
@@ -107,37 +76,12 @@ def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> 
     assert loop.record().faults == 2
 
 
-def test_the_turns_depend_on_the_encoders_alone(over_the_wire) -> None:
-    policy = InTurn()
-    policy.start(replace(over_the_wire, arrives="wire"), 0)
-
-    def who(wire: float, catheter: float) -> str:
-        decision = policy.decide(Observation(0.0, ((wire, 0.0), (catheter, 0.0)), None))
-        return next((who for who, (v, _) in zip(("wire", "catheter"), decision.devices, strict=False) if v > 0), "none")
-
-    assert who(5.0, 0.0) == "wire" and who(36.0, 0.0) == "wire"
-    assert who(5.0 + LEAD_MM, 5.0) == "catheter"
-    assert who(36.0, 20.0) == "catheter"  # it goes on to behind the wire's tip
-    assert who(36.0, 36.5 - BEHIND_MM) == "wire"
-    assert who(37.0, 27.5) == "none"  # 20 mm deeper than the target
+def test_a_catheter_alone_takes_the_wire_along(over_the_wire) -> None:
     alone = CatheterAlone()
     alone.start(over_the_wire, 0)
     decisions = [alone.decide(Observation(0.0, ((5.0, 0.0), (at, 0.0)), None)) for at in (0.0, 5.1, 60.0)]
-    assert [(d.devices[0][0] > 0, d.devices[1][0] > 0) for d in decisions] == [
-        (False, True),
-        (True, True),
-        (False, False),
-    ]
-
-
-def test_a_recording_of_both_is_driven_again_to_the_bit(over_the_wire) -> None:
-    done = attempt("in-turn", over_the_wire, seed=3)
-    recording = Recording.unpacked(done["recording"], 2)
-    figures = repeat(recording, over_the_wire, seed=3)
-    assert figures == {name: done[name] for name in figures}
-    assert len(Repeated(recording).decide(Observation(0.0, (), None)).devices) == 2
-    with pytest.raises(InputError, match="control: "):
-        Recording.unpacked(done["recording"])
+    moves = [tuple(speed > 0 for speed, _ in each.devices) for each in decisions]
+    assert moves == [(False, True), (True, True), (False, False)]
 
 
 def test_what_takes_a_wire_alone_says_so(over_the_wire) -> None:

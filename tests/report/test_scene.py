@@ -51,11 +51,6 @@ def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
     )
 
 
-def test_a_rollout_without_shapes_is_refused(rollout):
-    with pytest.raises(ValueError, match="record_shape"):
-        visible_devices(dataclasses.replace(rollout, shape=None), 0, 0)
-
-
 def test_every_sample_is_a_frame_and_a_step_of_the_slider(anatomy, rollout):
     figure = navigation_scene(anatomy, rollout)
     frames = list(figure.frames)
@@ -107,32 +102,6 @@ def test_a_catheter_covers_its_wire_and_both_are_named(anatomy, pair, devices):
     assert "Δtip = 16.0 mm" in wire.hovertemplate and "push of its drive = 0.50 N" in wire.hovertemplate
     for state in ("Δ = 7.0 mm", "φ = 180°", "push of its drive = 0.25 N"):
         assert state in catheter.hovertemplate
-
-
-def test_of_a_wire_in_its_catheter_the_tip_is_left(anatomy, pair, devices):
-    wire, catheter = navigation_scene(anatomy, pair, devices=devices).frames[5].data[:2]
-    np.testing.assert_allclose(wire.z, [-28.0])
-    assert np.array(catheter.z)[0] == -30.0 and len(catheter.z) > 20
-
-
-def test_samples_after_a_failure_are_not_shown(anatomy, rollout):
-    valid = rollout.valid.copy()
-    valid[0, 4:] = False
-    figure = navigation_scene(anatomy, dataclasses.replace(rollout, valid=valid))
-    assert [frame.name for frame in figure.frames] == ["0", "1", "2", "3"]
-
-
-def test_axes_are_equal_and_in_mm(anatomy):
-    scene = navigation_scene(anatomy).layout.scene
-    assert scene.aspectmode == "data"
-    assert all(axis.title.text.endswith("mm") for axis in (scene.xaxis, scene.yaxis, scene.zaxis))
-
-
-def test_sections_are_lines_of_their_own_and_joined(anatomy):
-    lines = {trace.name: trace for trace in navigation_scene(anatomy).data}
-    first, second = lines["Section 1"], lines["Section 2"]
-    assert first.line.color != second.line.color
-    assert np.nanmin(np.array(first.z)) == pytest.approx(np.nanmax(np.array(second.z)))
 
 
 def test_a_renderer_that_dies_is_one_line_and_no_picture(anatomy, tmp_path, monkeypatch):

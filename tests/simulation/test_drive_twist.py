@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import bend
 import numpy as np
@@ -14,7 +13,6 @@ from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import read_trajectory
 
 CONFIG = SimulatorConfig(element_mm=1.25, time_step_s=0.025, threads=1)
 BEHIND = Transmission(length_mm=1000.0, twist_friction_n_mm_mm=2e-4)
@@ -81,14 +79,6 @@ def test_a_drive_slips_at_its_own_torque(vessel, wire: Wire) -> None:
     assert 0.1 <= held < 0.11  # with the introducer's valve
     assert world.drive_rotation[0, 0] < 2.0  # of 24 rad that were commanded
     assert world.rotation[0, 0] == pytest.approx(0.0, abs=0.05)
-
-
-def test_a_trajectory_keeps_what_lies_behind(vessel, wire: Wire, tmp_path: Path) -> None:
-    trajectory = simulator(vessel, Stack(wire, (), (BEHIND,)), 1).run(commands(1, 4))
-    trajectory.write(tmp_path / "t.npz")
-    read = read_trajectory(tmp_path / "t.npz", anatomy=vessel)
-    assert read.set_up.stacks[0].transmissions == (BEHIND,)
-    assert np.array_equal(read.replay().tip_position, trajectory.tip_position)
 
 
 def test_what_cannot_be(vessel, wire: Wire) -> None:

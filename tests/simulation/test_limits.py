@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot import _core
 from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
-from endopilot.verification.case import STATIC, X_AXIS, straight_rod
+from endopilot.verification.case import STATIC, X_AXIS, Loading, straight_rod
 
 LENGTH_MM, EI, GJ, EA, ELEMENTS = 40.0, 60.0, 46.0, 900.0, 20
 PUSH_N, PULL_N, TORQUE_N_MM = 0.2, 0.3, 1.5
@@ -36,16 +35,9 @@ def held_at_its_tip(speed: float, spin: float, samples: int = 40) -> dict[str, n
     """Return what a straight rod does whose tip is held and whose base is moved (mm/s, rad/s)."""
     rod = straight_rod(elements=ELEMENTS, length_mm=LENGTH_MM, bend=EI, twist=GJ, stretch=EA)
     nodes, tip = len(rod.abscissa_mm), np.array([START_MM, 0.0, 0.0])
-    spring, anchor, hold = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros(nodes)
-    spring[0], anchor[0], hold[0] = STIFF, tip, STIFF
-    loads = _core.make_loads(
-        force=np.zeros((nodes, 3)),
-        moment=np.zeros((nodes, 3)),
-        spring=spring,
-        anchor=anchor,
-        hold=hold,
-        attitude=np.tile([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0], (nodes, 1)),
-    )
+    loading = Loading.none(nodes)
+    loading.spring_n_mm[0], loading.anchor_mm[0], loading.hold_n_mm[0] = STIFF, tip, STIFF
+    loading.attitude[:] = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]
     control = np.tile([speed, spin], (1, samples, 1))
     control[:, TURNS_BACK:] *= -1.0
     result = run_core(
@@ -56,7 +48,7 @@ def held_at_its_tip(speed: float, spin: float, samples: int = 40) -> dict[str, n
         initial=np.array([[START_MM, 0.0]]),
         control=control,
         friction=np.zeros(1),
-        loads=loads,
+        loads=loading.core(),
         lanes=1,
         approach=False,
         free_behind_mm=0.0,

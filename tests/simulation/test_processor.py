@@ -37,14 +37,11 @@ def put_gpu(monkeypatch: pytest.MonkeyPatch, **changed: Any) -> list[int]:
     return given
 
 
-def test_a_build_without_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_and_a_machine_without_gpu_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "endopilot._core_cuda", None)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"'cuda': endopilot was built without it; build it with .*ENDOPILOT_CUDA"):
         core_for("cuda")
     assert core_for("cpu") is _core
-
-
-def test_a_machine_without_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     put_gpu(monkeypatch, why_no_gpu=lambda: "no CUDA-capable device is detected")
     with pytest.raises(
         InputError, match=r"processor: 'cuda': no GPU can be used here \(no CUDA-capable device is detected\)"

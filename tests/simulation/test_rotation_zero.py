@@ -59,11 +59,8 @@ def tips(anatomy: Anatomy) -> np.ndarray:
 # +z stays, becomes −z about either of the other axes (where the shortest turn from +z is singular), becomes +x, +y;
 # then any turns.
 TURNS = [
-    *(
-        Rotation.from_euler("xyz", angles, degrees=True)
-        for angles in ([180, 0, 0], [0, 180, 0], [0, 90, 0], [-90, 0, 0])
-    ),
-    *Rotation.random(2, rng=np.random.default_rng(35)),
+    *(Rotation.from_euler("xyz", angles, degrees=True) for angles in ([180, 0, 0], [0, 180, 0], [0, 90, 0])),
+    Rotation.random(rng=np.random.default_rng(35)),
 ]
 
 
@@ -77,16 +74,15 @@ def test_a_turned_vessel_turns_the_motion():
     assert off_mm > 1.0  # by the world's axes it does something else: the comparison above can fail
 
 
-@pytest.mark.parametrize("phi", [0.0, 0.5, np.pi / 2])
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.1, -0.99, 0.1]])
-def test_the_bend_points_to_the_zero_and_turns_clockwise_as_the_operator_sees_it(direction, phi):
+def test_the_bend_points_to_the_zero_and_turns_clockwise_as_the_operator_sees_it(direction):
     axis = np.array(direction) / np.linalg.norm(direction)
     tree = tree_from_lines([Line(np.arange(0.0, 41.0)[:, None] * axis, np.full(41, 8.0), -1, 0)])
     insertion = Insertion(np.zeros(3), axis)
     lumen = add_catheter(distance_map_from_spheres(tree, spacing_mm=1.5), insertion, 8.0)
     anatomy = Anatomy("wide", tree, lumen, insertion, 8.0)
-    device, start = read_wire("workhorse-014"), np.array([[15.0, phi]])
-    trajectory = simulate(anatomy, device, np.zeros((1, 1, 2)), initial=start)
+    phi, device = 0.5, read_wire("workhorse-014")
+    trajectory = simulate(anatomy, device, np.zeros((1, 1, 2)), initial=np.array([[15.0, phi]]))
     zero = zero_of(anatomy)
     right = np.cross(axis, zero)  # of the operator, who looks along the axis with the zero above
     across = trajectory.tip_direction[0, 0, 0] - (trajectory.tip_direction[0, 0, 0] @ axis) * axis

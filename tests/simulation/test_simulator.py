@@ -101,7 +101,7 @@ def test_ctrl_c_stops_a_step_that_has_begun(anatomy: Anatomy, worlds: int) -> No
 
 def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy, wider: Anatomy) -> None:
     first = begun(Simulator(anatomy, [DEVICE, STIFF, DEVICE]), 3)
-    second = Simulator(anatomy, [STIFF, DEVICE], sharing=[first])
+    second = Simulator(anatomy, [STIFF, DEVICE])
     second.copy_worlds([1, 2], of=first)
     moved = second.step(controls(1, 2)[0], PERIOD)
     wanted = first.step(controls(1, 2)[0][[0, 0, 1]], PERIOD)  # world 1 and world 2 get the controls of their copies
@@ -123,7 +123,7 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
     for control in controls(2, 4):
         step, wanted = simulator.step(control, PERIOD), shared.step(control, PERIOD)
         assert np.array_equal(step.tip_position, wanted.tip_position)
-    elsewhere = Simulator(again, read_wire("workhorse-014"), worlds=2, sharing=[simulator])
+    elsewhere = Simulator(again, read_wire("workhorse-014"), worlds=2)
     elsewhere.copy_worlds([2, 1], of=simulator)
     assert np.array_equal(elsewhere.position, simulator.position[[2, 1]])
     simulator.set_state(shared.state)
@@ -195,14 +195,6 @@ def test_force_drive_stops_where_the_wire_is_out(anatomy: Anatomy) -> None:
     assert simulator.valid.all()
     # 0.5 N less the valve's 0.05 N on a stop of 100 N/mm
     assert simulator.inserted_length[0, 0] == pytest.approx(-0.0045, abs=1e-3)
-
-
-def test_torch_tensors_go_in_and_out(anatomy: Anatomy) -> None:
-    import torch
-
-    simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
-    step = simulator.step(torch.tensor([[1.0, 0.5], [2.0, 0.0]]), 0.1)
-    assert torch.from_dlpack(step.tip_position).shape == (2, 1, 3)
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_a_wire_in_a_map_with_steep_walls_moves_alone_as_in_company() -> None:
     values = np.maximum(4.0 * fork.distance_map.values, -1.0)
     steep = replace(fork, distance_map=replace(fork.distance_map, values=values))
     draw = np.random.default_rng(3)
-    control = np.stack([draw.uniform(-20, 40, (16, 12)), draw.uniform(-6, 6, (16, 12))], axis=-1)
+    control = np.stack([draw.uniform(-20, 40, (5, 12)), draw.uniform(-6, 6, (5, 12))], axis=-1)
     together = endopilot.simulate(steep, read_wire("workhorse-014"), control)
     for world in range(len(control)):
         alone = endopilot.simulate(steep, read_wire("workhorse-014"), control[[world]])

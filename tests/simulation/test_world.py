@@ -249,20 +249,17 @@ def test_a_file_holds_a_world(tmp_path):
         ("share: 1.0", "share: 1.0; give a number from 0 to below 1"),
         ("- 1", "holds no mapping of fields"),
         ("about: [", "YAML"),
+        (None, "choose from nominal, "),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
     path = tmp_path / "world.yaml"
-    path.write_text(text, encoding="utf-8")
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as error:
         read_world(path)
-    assert str(error.value).startswith(str(path)) and message in str(error.value)
+    assert str(path) in str(error.value) and message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_an_unknown_world_names_those_that_are_there():
-    with pytest.raises(InputError, match="world 'none': no such world or file; give a path, or choose from nominal, "):
-        read_world("none")
 
 
 @pytest.fixture(scope="module")

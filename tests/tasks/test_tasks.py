@@ -16,7 +16,7 @@ from endopilot.ladder.scores import COAXIAL
 from endopilot.settings import read_settings
 from endopilot.tasks import task
 from endopilot.tasks.targets import find_target, turn_rad
-from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
+from endopilot.tasks.task import Task, find_task, list_tasks
 from toy_tasks import own_tasks
 
 FOLDER = Path(task.__file__).parent
@@ -65,17 +65,7 @@ def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
         assert (each.start_catheter_mm or 0.0) < each.start_inserted_length_mm < target.abscissa
     navigation = find_task("follow", version="coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
-    alone = without_catheter(navigation)
-    assert (
-        alone.arrives == "wire"
-        and not alone.catheters
-        and alone.start_inserted_length_mm == navigation.start_inserted_length_mm
-    )
-    assert (alone.target, alone.start_rotation_rad) == (navigation.target, navigation.start_rotation_rad)
-
-
-def test_the_side_branch_leaves_at_ninety_degrees_or_more():
-    steep = find_task("side-branch", version="coaxial")
+    steep = find_task("side-branch", version="coaxial")  # its branch leaves at 90° or more
     for place in (0, 7):
         tree, _ = make_patient_tree(steep.atlas(steep.ladder.seed), steep.ladder.numbers[place])
         assert turn_rad(tree, find_target(tree, steep.section or "", depth_mm=0.5).branch) >= np.pi / 2
@@ -92,12 +82,8 @@ def test_the_target_lies_in_its_section(name):
 
 
 def test_a_ladder_navigation_is_the_same_every_time():
-    one, other = (find_task("straight").ladder_navigation(3) for _ in range(2))
-    assert (
-        one.start_rotation_rad
-        == other.start_rotation_rad
-        != find_task("straight").ladder_navigation(4).start_rotation_rad
-    )
+    one, other, third = (find_task("straight").ladder_navigation(place) for place in (3, 3, 4))
+    assert one.start_rotation_rad == other.start_rotation_rad != third.start_rotation_rad
     assert one.target == other.target
     assert np.array_equal(one.anatomy.distance_map.values, other.anatomy.distance_map.values)
     assert one.device.tip_bend_rad == pytest.approx(np.deg2rad(find_task("straight").tip_bend_deg))
@@ -107,12 +93,8 @@ def test_a_ladder_navigation_is_the_same_every_time():
     ("old", "new", "line"),
     [
         ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
-        ("seconds: 90", "seconds: -1", "seconds: -1; give a number above 0, at most 86400"),
-        ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
         ("vessel: rca", "vessel: knee", "vessel: 'knee'; choose from"),
         ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),
-        ("level: 6", "level: 6\nlength: 3", "length: no such field; the fields are name, level,"),
-        ("name: crux", "name: [", "line 4: not valid YAML"),
         ("seed: 8006", "seed: 7006", "training: patient 4 is of ladder too, which nobody trains on; leave it out"),
     ],
 )
@@ -146,6 +128,8 @@ def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
     assert len({task.ladder_navigation(number).start_rotation_rad for number in (0, 1)}) == 2
     with pytest.raises(InputError, match="no patients to learn on; add training"):
         task.patient(task.training, 0)
+    with pytest.raises(InputError, match="choose from 1, 2, coaxial, or give a folder of tasks"):
+        list_tasks(str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize(
@@ -162,11 +146,6 @@ def test_a_folder_of_tasks_has_its_own_anatomies_targets_and_wire(tmp_path):
 def test_what_is_wrong_in_a_task_of_ones_own_is_named(tmp_path, change, line):
     with pytest.raises(InputError, match=re.escape(line)):
         own_tasks(tmp_path, **change).ladder_navigation(0)
-
-
-def test_a_version_is_shipped_or_a_folder_of_tasks(tmp_path):
-    with pytest.raises(InputError, match="choose from 1, 2, coaxial, or give a folder of tasks"):
-        list_tasks(str(tmp_path))
 
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
@@ -194,11 +173,9 @@ def test_a_made_up_arch_becomes_a_task_with_the_benchmarks_wire(tmp_path):
     ("given", "said"),
     [
         (["none.npz", "x"], "none.npz: is no file of episodes (.npz) and no folder of curves"),
-        (["README.md", "x"], "README.md: is no file of episodes"),
         ([".", "x"], "holds no curves"),
         (["other.npz", "x"], "other.npz: holds no array SSS_target_mm"),
         (["episodes.npz"], "usage: steve_tasks.py EPISODES.npz|CURVES FOLDER [SEED]"),
-        (["episodes.npz", "x", "seed"], "usage: "),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(given, said, tmp_path, monkeypatch, capsys):
@@ -207,7 +184,6 @@ def test_bad_input_is_one_line_and_writes_nothing(given, said, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     made_up(Path("episodes.npz"))
     np.savez("other.npz", allow_pickle=False, lines=np.zeros(3))
-    Path("README.md").write_text("read me")
     monkeypatch.setattr(sys, "argv", ["steve_tasks.py", *given])
     with pytest.raises(SystemExit) as leaving:
         main()
@@ -222,7 +198,7 @@ def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
 
     assert len(convert(EPISODES, tmp_path / "steve")) == 49
     (task,) = list_tasks(str(tmp_path / "steve"))
-    for place, point in list(enumerate(task.targets_mm or ()))[::6]:
+    for place, point in list(enumerate(task.targets_mm or ()))[::16]:
         navigation = task.ladder_navigation(place)
         assert np.linalg.norm(navigation.target.position(navigation.anatomy) - point) < 1.0
 

@@ -94,25 +94,13 @@ def test_a_small_loop_closes() -> None:
     assert looped[0][-1] == pytest.approx(straight[0][-1], abs=1e-12)
 
 
-ELASTICA = {
-    1: (0.301721, 0.056433),
-    2: (0.493457, 0.160642),
-    3.7: (0.653000, 0.308452),
-    5: (0.713792, 0.387628),
-    10: (0.810609, 0.554996),
-    15: (0.847716, 0.635286),
-    40: (0.907371, 0.776395),
-}
-"""Deflection w/L and shortening u/L of a clamped rod of 100 elements, by α = F L²/EI."""
+def test_closed_form_of_the_elastica() -> None:
+    # elliptic integrals against Mattiasson's table: w/L and u/L by α = F L²/EI
+    for alpha, tip in ((1.0, (0.301721, 0.056433)), (10.0, (0.810609, 0.554996))):
+        assert free_rod.elastica_closed_form(alpha)[:2] == pytest.approx(tip, abs=1e-6)
 
 
-@pytest.mark.parametrize("alpha", [1.0, 2.0, 5.0, 10.0])
-def test_closed_form_of_the_elastica(alpha: float) -> None:
-    # elliptic integrals against Mattiasson's table
-    assert free_rod.elastica_closed_form(alpha)[:2] == pytest.approx(ELASTICA[alpha], abs=1e-6)
-
-
-@pytest.mark.parametrize("alpha", [1.0, 10.0, 40.0])
+@pytest.mark.parametrize("alpha", [1.0, 40.0])
 def test_whole_elastica(alpha: float) -> None:
     # Not the tip alone: all nodes lie on the solution of θ'' = -α cos θ, θ(0) = 0, θ'(L) = 0.
     x, y = free_rod.elastica_curve(alpha)

@@ -78,11 +78,6 @@ def add_catheter(
     return grown
 
 
-def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> float:
-    """Return how far a catheter (inner radius) may lean until its engaged tip meets the wall, degrees."""
-    return math.degrees(math.atan2(max(ostium_radius_mm - catheter_radius_mm, 0.0), ENGAGED_MM))
-
-
 def smooth_union(
     first: Float[np.ndarray, "nz ny nx"], second: Float[np.ndarray, "nz ny nx"], *, spacing_mm: float, fillet_mm: float
 ) -> Float[np.ndarray, "nz ny nx"]:

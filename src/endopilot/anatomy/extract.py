@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,14 +13,14 @@ from endopilot import __version__
 from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.distance import (
     CATHETER_RADIUS_MM,
+    ENGAGED_MM,
     add_catheter,
     automatic_spacing,
-    catheter_tilt_deg,
     distance_map_from_spheres,
 )
-from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
-from endopilot.anatomy.labels_coronary import SHORT_MM
-from endopilot.anatomy.tree import sampled, tree_from_lines, tree_from_polylines
+from endopilot.anatomy.labels import dominance, label_tree
+from endopilot.anatomy.labels_coronary import LONGEST_LEFT_MAIN_MM, SHORT_MM
+from endopilot.anatomy.tree import sampled, tree_from_lines
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
@@ -29,14 +28,15 @@ from endopilot.settings import Finite, Within, public, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
 from endopilot.vessels import coverage, repair, repair_surface
 from endopilot.vessels.coronary_inlet import CoronaryInlet, coronary_inlet
-from endopilot.vessels.coronary_ostia import Side, course_off_deg
+from endopilot.vessels.coronary_ostia import course_off_deg
 from endopilot.vessels.graph import lumen_graph
 from endopilot.vessels.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
+from endopilot.vessels.line_graph import found_lines
+from endopilot.vessels.medial_lines import traced_lines
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import (
     ANSWERED,
     ASSUMED,
-    BY_ARRAYS,
     SMALLEST_RADIUS_MM,
     AnatomySource,
     Polylines,
@@ -56,7 +56,7 @@ atlas and 2 real ones its own is the nearer one by 16° at least."""
 
 SHORTEST_IN_DIAMETERS = 1.5  # a lumen whose longest path is shorter than so many mean diameters is no vessel
 
-_KNOWN = {ASSUMED: " (not stated)", BY_ARRAYS: " (SimVascular's arrays)", ANSWERED: " (--scale)"}
+_KNOWN = {ASSUMED: " (not stated)", ANSWERED: " (--scale)"}
 
 
 @settings
@@ -118,12 +118,15 @@ def extract_anatomy(
         given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
     source_name, unit = wrapped.file or name, {"factor": wrapped.factor, "odds": wrapped.odds}
     with progress(f"anatomy {name}", 4) as advance:
-        if isinstance(content, (Polylines, VesselTree)):
-            if isinstance(content, Polylines):
-                points, radius = np.concatenate(content.points), np.concatenate(content.radius)
-                check_unit(points, float(np.median(radius)), config.vessel, source_name, **unit)
-            made = tree_from_polylines(content, given, source_name, config.vessel)
-            tree, rule, balance = made.tree, made.rule, made.coverage
+        if isinstance(content, VesselTree):
+            own = [branch.centerline for branch in content.branches]
+            content = Polylines(tuple(line.points for line in own), tuple(line.radius for line in own))
+        elif isinstance(content, Polylines):
+            points, radius = np.concatenate(content.points), np.concatenate(content.radius)
+            check_unit(points, float(np.median(radius)), config.vessel, source_name, **unit)
+        if isinstance(content, Polylines):
+            made = found_lines(content, given, source_name, config.vessel)
+            tree, rule, balance = tree_from_lines(made.lines), made.rule, made.coverage
             notes += made.notes
             inlet: CoronaryInlet | None = None
             advance(2)
@@ -136,39 +139,40 @@ def extract_anatomy(
             surface, lumen, widened, inlet = _wall(content, given, config, source_name, axes)
             voxels_mm = lumen.mask.spacing_mm
             check_unit(surface.vertices, surface.mean_radius, config.vessel, source_name, **unit)
-            notes += [*lumen.notes, *(inlet.notes if inlet is not None else ())]
+            notes += lumen.notes
             advance()
             finest = float(voxels_mm.min()) if isinstance(content, LumenMask) else 0.0
-            tree, rule, rivals = _tree(surface, finest, given, inlet, config, source_name)
+            tree, rule = _tree(surface, finest, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
-            notes += rivals
-            left = coverage.unreached(lumen.before, *sampled(tree), float(voxels_mm.max()))
-            balance = coverage.record(lumen.before, widened, left)
-            left = [stretch for stretch in left if not lumen.told[stretch.nodes].all()]
+            left = coverage.unreached(lumen.lines, *sampled(tree), float(voxels_mm.max()))
+            balance = coverage.record(lumen.lines, widened, left)
             line = tree.branches[0].centerline
             notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + float(voxels_mm.max()))
         advance()
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
-        short = _short(tree, config.vessel)
-        notes += short + _other_side(tree, config.vessel) + missing_main_vessel(tree)
+        notes += _doubts(tree, config.vessel)
         insertion = _insertion(tree, given)
         ostium_radius = float(np.median(tree.branches[0].centerline.radius[:3]))
         resolved = max(CATHETER_RADIUS_MM, _RESOLVED_STEPS * distance_map.spacing_mm)
         radius = config.catheter_radius_mm or min(resolved, ostium_radius)
         distance_map = add_catheter(distance_map, insertion, radius)
         advance()
-    dominant = None if short else dominance(tree)
+    dominant = None if tree.longest_path().abscissa[-1] < SHORT_MM else dominance(tree)
     if inlet is not None and inlet.other is not None:
         dominant = None if inlet.crux is None else inlet.crux.dominance
     provenance = {
         "endopilot": __version__,
-        "source": _source_record(wrapped),
+        "source": {
+            "file": wrapped.file or None,
+            "sha256": wrapped.sha256 or None,
+            "kind": type(wrapped.content).__name__,
+        },
         "config": asdict(config),
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
-        "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
+        "catheter_tilt_deg": round(float(np.degrees(np.arctan2(max(ostium_radius - radius, 0.0), ENGAGED_MM))), 1),
         "dominance": dominant,
         "coverage": balance,
         "notes": [_understood(tree, wrapped, config.coordinates), *doubts, *notes],
@@ -188,9 +192,8 @@ def _wall(
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label, axes)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
-    other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
-        lumen = repair.connected_mask(content.volume, given, label, config.vessel, other)
+        lumen = repair.connected_mask(content.volume, given, label, config.vessel)
         mask, wide, thin = coverage.widened(lumen.mask, lumen.lines, config.minimum_branch_length_mm)
         finest, surface = float(mask.spacing_mm.min()), surface_from_mask(mask)
         if surface.mean_radius < min(SMALLEST_RADIUS_MM, finest):
@@ -199,53 +202,35 @@ def _wall(
                 f"{finest:.2g} mm), too thin to follow; segment on a finer grid"
             )
         return surface, replace(lumen, notes=[*remarks, *lumen.notes, *thin]), wide, inlet
-    surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
+    surface, notes = repair_surface.closed_surface(content, given, label, config.vessel)
     step = min(surface.mean_radius, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
-    _, touches, lines, _ = parted(voxels)
-    notes += touch_remarks(touches, parted=False)
-    lumen = repair.Lumen(voxels, lines, lines, np.zeros(len(lines.points), dtype=bool), notes)
-    return surface, lumen, np.empty((0, 3)), inlet
+    notes += touch_remarks(parted(voxels)[1], parted=False)
+    return surface, repair.Lumen(voxels, traced_lines(voxels), notes), np.empty((0, 3)), inlet
 
 
-def _short(tree: VesselTree, vessel: str) -> list[str]:
-    longest = float(tree.longest_path().abscissa[-1])
-    if vessel == "generic" or longest >= SHORT_MM:
+def _doubts(tree: VesselTree, vessel: str) -> list[str]:
+    """Say so if a labelled coronary tree is short, runs as the other coronary artery does, or lacks a main vessel."""
+    if vessel == "generic":
         return []
-    name = "right" if vessel == "rca" else "left"
-    return [f"the {name} coronary artery is only {longest:.0f} mm long here: it is a vestige, or cut off or occluded"]
-
-
-def _other_side(tree: VesselTree, vessel: str) -> list[str]:
-    """Say so if a tree lies from its ostium as the other coronary artery does."""
-    if vessel == "generic" or float(tree.longest_path().abscissa[-1]) < SHORT_MM:
-        return []
-    off = course_off_deg(tree)
-    other: Side = "lca" if vessel == "rca" else "rca"
-    if off[vessel] < off[other] + _OTHER_SIDE_DEG:
-        return []
-    asked, found = ("right", "left") if vessel == "rca" else ("left", "right")
-    return [
-        f"the vessel runs as a {found} coronary artery does: {off[other]:.0f}° from the usual course of one, "
-        f"{off[vessel]:.0f}° from that of the {asked} one; check --vessel, and the axes of the file"
-    ]
-
-
-def _source_record(source: AnatomySource) -> dict[str, str | None]:
-    digest, content = source.sha256, source.content
-    if not digest:
-        arrays: list[np.ndarray]
-        if isinstance(content, LumenMask):
-            volume = content.volume
-            arrays = [volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction]
-        elif isinstance(content, Surface):
-            arrays = [content.vertices, content.faces]
-        elif isinstance(content, VesselTree):
-            arrays = [part for b in content.branches for part in (b.centerline.points, b.centerline.radius)]
-        else:
-            arrays = [*content.points, *content.radius]
-        digest = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
-    return {"file": source.file or None, "sha256": digest, "kind": type(content).__name__}
+    asked, found, other = ("right", "left", "lca") if vessel == "rca" else ("left", "right", "rca")
+    longest, off, said = float(tree.longest_path().abscissa[-1]), course_off_deg(tree), list[str]()
+    if longest < SHORT_MM:
+        said.append(
+            f"the {asked} coronary artery is only {longest:.0f} mm long here: a vestige, or cut off or occluded"
+        )
+    elif off[vessel] >= off[other] + _OTHER_SIDE_DEG:
+        said.append(
+            f"the vessel runs as a {found} coronary artery does: {off[other]:.0f}° from the usual course of one, "
+            f"{off[vessel]:.0f}° from that of the {asked} one; check --vessel, and the axes of the file"
+        )
+    for number, name in (("6", "anterior descending"), ("11", "circumflex")):
+        if vessel == "lca" and number not in tree.sections_present:
+            said.append(
+                f"the left main does not fork within {LONGEST_LEFT_MAIN_MM:g} mm here: the {name} artery is missing, "
+                "cut off or a piece apart, and the sections of the other one are named by its course alone"
+            )
+    return said
 
 
 def _tree(
@@ -255,8 +240,8 @@ def _tree(
     inlet: CoronaryInlet | None,
     config: AnatomyConfig,
     label: str,
-) -> tuple[VesselTree, str, list[str]]:
-    """Return the centerline tree inside a closed wall, the rule by which its root was chosen, and its rivals."""
+) -> tuple[VesselTree, str]:
+    """Return the centerline tree inside a closed wall, and the rule by which its root was chosen."""
     mean_radius = surface.mean_radius
     if config.vessel != "generic":  # a piece of the aorta in the lumen must not set the scale
         mean_radius = min(mean_radius, CORONARY_RADIUS_MM)
@@ -277,11 +262,9 @@ def _tree(
     points, clearance = grid_points(distance_map, inside)
     if len(points) < 20:
         raise InputError(f"{label}: the lumen is too small to follow ({len(points)} grid points); check the unit")
-    rivals: list[str] = []
     if given is None:
-        first, *others = inlets(surface, points, clearance, spacing)
-        root = int(np.linalg.norm(points - first.position, axis=1).argmin())
-        rivals = first.rivals(others)
+        likeliest = inlets(surface, points, clearance, spacing)[0]
+        root = int(np.linalg.norm(points - likeliest.position, axis=1).argmin())
     else:
         if not given.direction.any() and rule == "given":
             side = None if config.vessel == "generic" else config.vessel
@@ -301,7 +284,7 @@ def _tree(
             f"{label}: is no vessel: its longest path of {longest.abscissa[-1]:.1f} mm is not much more than its width "
             f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
         )
-    return tree, rule, rivals
+    return tree, rule
 
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:

@@ -33,6 +33,7 @@ from endopilot.vessels.surface import polydata_of
 SCHEMA_VERSION = 2
 
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
+_RADIUS = "MaximumInscribedSphereRadius"
 
 
 @public
@@ -78,23 +79,15 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         raise InputError(
             f"{folder / _RECORD}: schema_version is {version}, not 1 or {SCHEMA_VERSION}; make the anatomy again"
         )
-    try:
+    with files.reading(folder / _RECORD, "make the anatomy again"):
         insertion = _insertion(record["insertion"], version)
         names, radius = tuple(map(str, record["section_names"])), float(record["catheter_radius_mm"])
         name, provenance, hashes = str(record["name"]), dict(record["provenance"]), dict(record["sha256"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / _RECORD}: damaged ({error!r}); make the anatomy again") from error
     for file in (_CENTERLINE, _LUMEN):
         if not (folder / file).exists():
             raise InputError(f"{folder / file}: is missing; make the anatomy again")
         if files.sha256(folder / file) != hashes.get(file):
             raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
-    length = float(np.linalg.norm(insertion.direction))
-    if abs(length - 1.0) > 1e-3 or not 0 < radius < np.inf:
-        raise InputError(
-            f"{folder / _RECORD}: insertion.direction has a length of {length:g} instead of 1, or catheter_radius_mm "
-            f"{radius:g} is not positive; make the anatomy again"
-        )
     anatomy = Anatomy(
         name=name,
         tree=_read_tree(folder / _CENTERLINE, names),
@@ -125,7 +118,7 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
     offsets = np.concatenate([[0], np.cumsum(counts)])
     polydata = polydata_of(whole.points, offsets, np.arange(offsets[-1]), "Lines")
     columns: dict[str, tuple[Any, np.ndarray]] = {
-        "MaximumInscribedSphereRadius": (polydata.GetPointData(), whole.radius),
+        _RADIUS: (polydata.GetPointData(), whole.radius),
         "Abscissa": (polydata.GetPointData(), whole.abscissa),
         "Normals": (polydata.GetPointData(), whole.normals),
         "Section": (polydata.GetPointData(), np.concatenate([branch.section for branch in tree.branches])),
@@ -145,41 +138,15 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
 
 
 def _read_tree(path: Path, section_names: tuple[str, ...]) -> VesselTree:
-    data = mesh_process.read(str(path))
-    if complaint := " ".join(str(data["complaint"]).split()):
-        raise InputError(f"{path}: is damaged ({complaint[:160]}); make the anatomy again")
-    try:
-        points, offsets = data["points"], data["line_offsets"]
-        radius, abscissa = data["point:MaximumInscribedSphereRadius"], data["point:Abscissa"]
-        normals, section, parent = data["point:Normals"], data["point:Section"], data["cell:Parent"]
-    except KeyError as error:
-        raise InputError(f"{path}: is not a centerline written by endopilot; make the anatomy again") from error
-    count = len(points)
-    whole = (
-        len(offsets) == len(parent) + 1 > 1
-        and offsets[-1] == count
-        and np.array_equal(data["line_points"], np.arange(count))
-        and np.diff(offsets).min() >= 2
-        and normals.shape == (count, 3)
-        and all(values.shape == (count,) for values in (radius, abscissa, section))
-        and all(np.isfinite(values).all() for values in (points, radius, abscissa, normals))
-        and bool((radius > 0).all())
-        and bool(((section >= 0) & (section < len(section_names))).all())
-        and parent[0] == -1
-        and bool(((parent[1:] >= 0) & (parent[1:] < np.arange(1, len(parent)))).all())
-    )
-    if not whole:
-        raise InputError(
-            f"{path}: is no tree (branches after their parents, positive radii, sections that anatomy.json names); "
-            "make the anatomy again"
-        )
-    branches = []
-    for index, (start, end) in enumerate(itertools.pairwise(offsets)):
-        part = slice(int(start), int(end))
-        line = Centerline(points[part].copy(), radius[part].copy(), abscissa[part].copy(), normals[part].copy())
-        if (np.diff(line.abscissa) <= 0).any():
-            raise InputError(f"{path}: the abscissa of branch {index} does not grow; make the anatomy again")
-        branches.append(Branch(line, int(parent[index]), section[part].astype(np.int64)))
+    with files.reading(path, "make the anatomy again"):
+        data, branches = mesh_process.read(str(path)), list[Branch]()
+        section = data["point:Section"].astype(np.int64)
+        if section.max() >= len(section_names):
+            raise ValueError("some sections are not among those that anatomy.json names")
+        columns = data["points"], *(data[f"point:{name}"] for name in (_RADIUS, "Abscissa", "Normals"))
+        for (start, end), parent in zip(itertools.pairwise(data["line_offsets"]), data["cell:Parent"], strict=True):
+            line = Centerline(*(values[start:end].copy() for values in columns))
+            branches.append(Branch(line, int(parent), section[start:end]))
     return VesselTree(tuple(branches), section_names)
 
 
@@ -195,11 +162,4 @@ def _write_distance_map(distance_map: DistanceMap, path: Path) -> None:
 def _read_distance_map(path: Path) -> DistanceMap:
     with files.reading(path, "make the anatomy again"):
         volume = read_nrrd(path).volume
-        values, spacing, axes = volume.voxels.astype(np.float32), volume.spacing_mm, volume.direction
-        if np.abs(axes - np.eye(3)).max() > 1e-6:
-            raise ValueError(f"its axes {axes.round(4).tolist()} are not along the LPS axes")
-        if np.ptp(spacing) > 1e-6 * spacing.max():
-            raise ValueError(f"its spacing {spacing.tolist()} mm is not the same along all axes")
-        if not np.isfinite(values).all():
-            raise ValueError("some distances are not finite numbers")
-    return DistanceMap(values=values, spacing_mm=float(spacing[0]), origin_mm=volume.origin_mm)
+    return DistanceMap(volume.voxels.astype(np.float32), float(volume.spacing_mm[0]), volume.origin_mm)

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from endopilot.anatomy.labels_coronary import LONGEST_LEFT_MAIN_MM, NEAREST_CRUX_MM, label_lca, label_rca
+from endopilot.anatomy.labels_coronary import NEAREST_CRUX_MM, label_lca, label_rca
 from endopilot.anatomy.labels_tree import LCA_SECTIONS, RCA_SECTIONS, Labeller
 from endopilot.types import Branch, VesselTree
 from endopilot.vessels.coronary_ostia import Crux
@@ -56,21 +56,6 @@ def dominance(tree: VesselTree) -> str | None:
             return None
         return "left" if "15" in used else "balanced" if _feeds_inferior_wall(tree) else "right"
     return None
-
-
-def missing_main_vessel(tree: VesselTree) -> list[str]:
-    """Say so if a labelled left coronary tree lacks one of the two main vessels: then all names are less sure."""
-    missing = [
-        name
-        for number, name in (("6", "anterior descending"), ("11", "circumflex"))
-        if number not in tree.sections_present
-    ]
-    if tree.section_names != LCA_SECTIONS or not missing:
-        return []
-    return [
-        f"the left main does not fork within {LONGEST_LEFT_MAIN_MM:g} mm here: the {missing[0]} artery is missing, cut "
-        "off or a piece apart, and the sections of the other one are named by its course alone"
-    ]
 
 
 def _feeds_inferior_wall(tree: VesselTree) -> bool:

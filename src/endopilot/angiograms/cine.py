@@ -75,11 +75,7 @@ class Cine:
     """
 
     def __init__(self, config: AngiogramsConfig, draw: CineDraw, imager: XrayImager) -> None:
-        """Simulate what a cine shows.
-
-        Raises:
-            InputError: the devices do not fit, or there is no such policy.
-        """
+        """Simulate what a cine shows. Raises InputError for devices that do not fit, or no such policy."""
         self.config, self.draw, self.imager = config, draw, imager
         anatomy = imager.anatomy
         self.view: View = view_of(

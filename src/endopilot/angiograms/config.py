@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 from endopilot import __version__
-from endopilot.dataset.layout import assign_splits, identify
+from endopilot.dataset.layout import assign_splits, check_names, identify, settled
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.files import input_hash, json_text, sha256
+from endopilot.files import input_hash, sha256
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.settings import Ascending, Finite, Positive, Seed, Share, Text, Within, settings
 from endopilot.simulation.motion import MotionName
@@ -132,18 +130,14 @@ class Layout:
 
 
 def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:
-    """Read who the patients are, and share them among the splits.
-
-    Raises:
-        InputError: no source, or one that cannot be read; two of one name; too few for the splits.
-    """
+    """Read who the patients are, and share them among the splits. Raises InputError for no source, or one that cannot
+    be read; two of one name; too few for the splits."""
     if not sources:
         raise InputError("anatomies: none given; name folders made by `endopilot anatomy` or `endopilot atlas`, or CTs")
     found = [_identified(path) for path in sources]
     names = tuple(name for name, _ in found)
+    check_names(names)
     for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
         if Path(name).name != name or name.startswith("."):
             raise InputError(f"anatomies: '{name}' names no folder; give the patient another name")
     splits = assign_splits(names, 1, anatomy_shares=config.anatomy_shares, seen_test_share=0.0)[:, 0]
@@ -154,9 +148,7 @@ def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: Angiogr
         "patients": dict(found),
         "version": f"endopilot {__version__}, format {FORMAT_VERSION}",
     }
-    settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
-    key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    return Layout(Path(output), config, stack, tuple(sources), names, tuple(splits.tolist()), settings, key)
+    return Layout(Path(output), config, stack, tuple(sources), names, tuple(splits.tolist()), *settled(settings))
 
 
 def is_anatomy(path: Path) -> bool:
@@ -165,11 +157,8 @@ def is_anatomy(path: Path) -> bool:
 
 
 def _identified(path: Path) -> tuple[str, str]:
-    """Return a patient's name, and the hash of the vessel and of its CT.
-
-    Raises:
-        InputError: there is no such file or folder, or the folder is empty or holds a damaged anatomy.
-    """
+    """Return a patient's name, and the hash of the vessel and of its CT. Raises InputError for no such file or folder,
+    an empty one, or one with a damaged anatomy."""
     if is_anatomy(path):
         name, identity = identify(path)
         ct = path / CT_FILE

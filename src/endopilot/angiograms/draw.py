@@ -182,11 +182,8 @@ class Driven:
 
 
 def drive_devices(config: AngiogramsConfig, draw: CineDraw, anatomy: Anatomy, stack: Stack) -> Driven:
-    """Simulate the devices of a cine.
-
-    Raises:
-        InputError: the devices do not fit, no motion of them can be simulated, or there is no such policy.
-    """
+    """Simulate the devices of a cine. Raises InputError for devices that do not fit or cannot be simulated, or no such
+    policy."""
     samples, period_s = draw.lead + config.frames, 1 / config.frames_per_second
     for attempt in range(_ATTEMPTS):
         key = [draw.drive_seed, attempt]

@@ -46,10 +46,8 @@ def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16
 def write_xa(
     path: Path, cine: Cine, frames: UInt16[np.ndarray, "frames rows columns"], *, number: int, identity: str
 ) -> None:
-    """Write the frames of a cine, of this number among those of the patient, of whose identity UIDs are made.
-
-    The same cine gives the same bytes.
-    """
+    """Write the frames of a cine, of this number among those of the patient, of whose identity UIDs are made; the same
+    cine gives the same bytes."""
     header = _header(cine, number, identity)
     header.NumberOfFrames, header.Rows, header.Columns = frames.shape
     header.PixelData = frames.tobytes()
@@ -205,11 +203,8 @@ _kept: dict[str, XrayImager] = {}
 
 
 def write_patient(layout: Layout, folder: Path) -> None:
-    """Write a patient's vessel and CT into the data set. The vessel of a CT is segmented.
-
-    Raises:
-        InputError: the source cannot be read, the CT shows no such vessel, or the devices do not fit.
-    """
+    """Write a patient's vessel and CT into the data set; the vessel of a CT is segmented. Raises InputError for a
+    source that cannot be read, a CT without such a vessel, or devices that do not fit."""
     source, segmentation = layout.sources[layout.names.index(folder.name)], layout.config.segmentation
     if is_anatomy(source):
         anatomy = read_anatomy(source)
@@ -228,11 +223,8 @@ def write_patient(layout: Layout, folder: Path) -> None:
 
 
 def write_cine(layout: Layout, folder: Path) -> None:
-    """Make a cine, and write its frames, and what is true of them, into its folder.
-
-    Raises:
-        InputError: no motion of the devices can be simulated in the vessel, or there is no such policy.
-    """
+    """Make a cine, and write its frames, and what is true of them, into its folder. Raises InputError where no motion
+    of the devices can be simulated in the vessel, or for no such policy."""
     name, _, number = folder.name.rpartition("-")
     imager, patient = _imager(layout, name), layout.names.index(name)
     draw = draw_cine(layout.config, imager.anatomy, int(number))

@@ -103,30 +103,22 @@ def free_origin(draw: Draw, mean_mm: float, sd_mm: float, taken: Sequence[int]) 
             return origin
 
 
-def stenosis(
-    draw: Draw, along: Float[np.ndarray, "n"], shares: tuple[float, float]
-) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
-    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm within `shares`, and the radius's factor."""
-    place = along[0] + draw.generator.uniform(*shares) * (along[-1] - along[0])
-    extent, degree = draw.generator.uniform(6.0, 14.0), draw.generator.uniform(0.3, 0.65)
-    narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
-    drawn = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
-    return drawn, narrowing
-
-
 def stenoses(
     draw: Draw, along: Float[np.ndarray, "n"], shares: tuple[float, float]
 ) -> tuple[list[dict[str, Any]], Float[np.ndarray, "n"]]:
-    """Return a stenosis, by `tandem_share` a second one 12 to 40 mm from it where there is room, and their factor."""
-    tandem_share = draw.population.tandem_share
-    drawn, narrowing = stenosis(draw, along, shares)
-    if tandem_share == 0 or draw.generator.random() > tandem_share:
-        return [drawn], narrowing
-    for _ in range(10):
-        second, also = stenosis(draw, along, shares)
-        if 12.0 < abs(second["abscissa_mm"] - drawn["abscissa_mm"]) < 40.0:
-            return [drawn, second], narrowing * also
-    return [drawn], narrowing
+    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm within `shares`, by `tandem_share` a second one
+    12 to 40 mm from it where there is room, and the radius's factor."""
+    found, share = list[tuple[dict[str, Any], np.ndarray]](), draw.population.tandem_share
+    for attempt in range(11):
+        place = along[0] + draw.generator.uniform(*shares) * (along[-1] - along[0])
+        extent, degree = draw.generator.uniform(6.0, 14.0), draw.generator.uniform(0.3, 0.65)
+        drawn = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
+        narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
+        if attempt == 0 or 12.0 < abs(drawn["abscissa_mm"] - found[0][0]["abscissa_mm"]) < 40.0:
+            found.append((drawn, narrowing))
+        if len(found) == 2 or (attempt == 0 and (share == 0 or draw.generator.random() > share)):
+            break
+    return [drawn for drawn, _ in found], np.prod([narrowing for _, narrowing in found], axis=0)
 
 
 def narrowed(

@@ -221,8 +221,7 @@ class Belief:
         """The worlds of the members."""
         navigation, count = self.navigation, len(self.members)
         anatomies, stacks = zip(*(self.kinds[kind] for kind in self.kind), strict=True)
-        sharing = self.vessels.simulators
-        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=self._core, sharing=sharing)
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=self._core)
         self.vessels.prepared(simulator)
         start = np.tile(navigation.start, (count, 1, 1))
         factor = np.array([each.friction_factor for each in self.members])
@@ -448,8 +447,7 @@ class Belief:
 
     def _worlds_of(self, kind: int, count: int) -> Simulator:
         """Return a simulator of so many worlds of a kind, for copies of its members."""
-        known, shared = self.navigation.known_motion, [self.simulator]
-        return Simulator(*self.kinds[kind], worlds=count, motion=known, config=self._core, sharing=shared)
+        return Simulator(*self.kinds[kind], worlds=count, motion=self.navigation.known_motion, config=self._core)
 
     @cached_property
     def _copies(self) -> MovedCopies:

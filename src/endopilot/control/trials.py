@@ -94,7 +94,7 @@ class Trials:
     ) -> Trials:
         """Return so many trials of the vessels and devices that are held possible, `like` a simulator of these."""
         anatomies, stacks = zip(*(kind for kind in kinds for _ in range(count)), strict=True)
-        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config, sharing=[like])
+        simulator = Simulator(anatomies, stacks, motion=navigation.known_motion, config=like.config)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in stacks[0].devices]
         first, last = limits[0].travel_mm
         travel = first, last - _SHORT_MM

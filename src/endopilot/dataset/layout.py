@@ -124,11 +124,7 @@ class Layout:
     patients: tuple[Patient, ...]
     splits: Shaped[np.ndarray, "anatomies sequences"]
     settings: dict[str, Any]
-
-    @property
-    def key(self) -> str:
-        """What marks all files of this dataset."""
-        return hashlib.sha256(json_text(self.settings).encode()).hexdigest()
+    key: str
 
     def blocks(self) -> list[Block]:
         """Return the blocks in the order of their files."""
@@ -168,9 +164,7 @@ def make_layout(
     if not folders:
         raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
     names, identities = zip(*(identify(Path(folder)) for folder in folders), strict=True)
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
+    check_names(names)
     splits = assign_splits(
         names, config.sequences, anatomy_shares=config.anatomy_shares, seen_test_share=config.seen_test_share
     )
@@ -186,10 +180,24 @@ def make_layout(
         **({} if world == World() else {"world": world.differences()}),
         **(origin or {}),
     }
-    settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
+    settings, key = settled(settings)
     motions = (world.motion or patient_motion(config, name) for name in names)
     patients = tuple(map(Patient, map(Path, folders), names, identities, motions))
-    return Layout(Path(output), config, stack, task, robot, world, patients, splits, settings)
+    return Layout(Path(output), config, stack, task, robot, world, patients, splits, settings, key)
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise InputError where two patients have one name."""
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
+
+
+def settled(settings: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Return settings as JSON gives them back, so that they compare equal, and the key that marks all files of such a
+    data set."""
+    again = json.loads(json_text(settings))
+    return again, hashlib.sha256(json_text(again).encode()).hexdigest()
 
 
 def version() -> str:

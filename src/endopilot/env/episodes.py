@@ -84,7 +84,7 @@ class Episodes:
         nearer = (before - self.distance).sum(axis=1)
         rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         rewards = rewards + EXPOSURE_REWARD * exposed
-        terminations = (success | ~now.valid) & going
+        terminations = (success | ~now.worlds.valid) & going
         truncations = (self.steps >= self._most_steps) & ~terminations & going
         self.ended = terminations | truncations
         return np.where(fresh, 0.0, rewards), terminations, truncations
@@ -96,17 +96,17 @@ class Episodes:
         """Return what stands in the info of every world, as `NavigateVectorEnv` names it."""
         infos: dict[str, Any] = {
             "contact_force_max": now.contact_force,
-            "valid": now.valid,
+            "valid": now.worlds.valid,
             "success": self._success(now),
             "safe": self.safe.copy(),
             "distance_mm": self.distance[:, -1],
             "time_s": self.time_s,
         }
-        for k, prefix in enumerate(column_prefixes(now.rotation.shape[1])):
+        for k, prefix in enumerate(column_prefixes(now.encoders.shape[1])):
             tip = now.tip[:, k]
             infos |= {
-                f"{prefix}inserted_length": now.inserted_length[:, k],
-                f"{prefix}rotation": now.rotation[:, k],
+                f"{prefix}inserted_length": now.worlds.inserted_length[:, k],
+                f"{prefix}rotation": now.worlds.rotation[:, k],
                 f"{prefix}tip_abscissa": tip.abscissa,
                 f"{prefix}tip_offset": tip.offset,
                 f"{prefix}tip_branch": tip.branch,

@@ -115,41 +115,16 @@ def space(observed: Observed, catheters: int, images: tuple[int, int, int]) -> S
 class Measured:
     """The worlds at one moment; row i belongs to world i.
 
-    `tip` are projections of the tips, `position` and `direction` their places, LPS mm, and headings; `contact_force` is
-    the largest on one node, N; `encoders` are Δ, mm, and φ, rad, as measured, `distance_mm` path lengths to the target.
+    `worlds` has where devices lie then, and `contact_force` the largest force on one node, N, over the step that led
+    there; `tip` are projections of the tips, `distance_mm` path lengths from them to the target, and `encoders` are Δ,
+    mm, and φ, rad, as measured.
     """
 
-    tip: TipProjection
-    position: Float[np.ndarray, "worlds devices 3"]
-    direction: Float[np.ndarray, "worlds devices 3"]
+    worlds: Simulator | Step
     contact_force: Float[np.ndarray, "worlds"]
-    inserted_length: Float[np.ndarray, "worlds devices"]
-    rotation: Float[np.ndarray, "worlds devices"]
-    encoders: Float[np.ndarray, "worlds devices 2"]
-    valid: Bool[np.ndarray, "worlds"]
+    tip: TipProjection
     distance_mm: Float[np.ndarray, "worlds devices"]
-
-    @classmethod
-    def of(
-        cls,
-        simulator: Simulator,
-        encoders: Float[np.ndarray, "worlds devices 2"],
-        routes: RouteTables,
-        step: Step | None = None,
-    ) -> Measured:
-        """Return the worlds as they are now, with what encoders say, and the force over the step that led there."""
-        now, tip = simulator if step is None else step, simulator.project()
-        return cls(
-            tip=tip,
-            position=now.tip_position,
-            direction=now.tip_direction,
-            contact_force=simulator.contacts.max(axis=1) if step is None else step.contact_force_max,
-            inserted_length=now.inserted_length,
-            rotation=now.rotation,
-            encoders=encoders,
-            valid=now.valid,
-            distance_mm=routes.distance(tip),
-        )
+    encoders: Float[np.ndarray, "worlds devices 2"]
 
 
 def observe(
@@ -160,13 +135,13 @@ def observe(
 ) -> Float[np.ndarray, "worlds features"]:
     """Return the observations, as the specification has them."""
     out, on_route = list[np.ndarray](), routes.on_route(now.tip)
-    for device in range(now.rotation.shape[1]):
+    for device in range(now.encoders.shape[1]):
         tip, (inserted, turned) = now.tip[:, device], now.encoders[:, device].T
         out += [inserted / 100.0, np.cos(turned), np.sin(turned), tip.abscissa / 100.0, tip.offset / tip.radius]
         out += [now.distance_mm[:, device] / 100.0, on_route[:, device]]
         if device == 0:
             out += [now.contact_force / force_limit_n, time_share]
-            out += [routes.place(tip, now.position[:, 0], now.direction[:, 0])]
+            out += [routes.place(tip, now.worlds.tip_position[:, 0], now.worlds.tip_direction[:, 0])]
         out += [(inserted - tip.abscissa) / 10.0]
     return _bounded(np.column_stack(out))
 

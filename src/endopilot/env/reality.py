@@ -83,11 +83,8 @@ class Reality:
         motion: Motion | None,
         config: SimulatorConfig,
     ) -> None:
-        """Lay the devices out, each world as it is; the arguments are those of `NavigateVectorEnv`.
-
-        Raises:
-            InputError: no such world or robot; worlds that differ in what all must have in common.
-        """
+        """Lay the devices out, each world as it is; the arguments are those of `NavigateVectorEnv`. InputError for no
+        such world or robot, or worlds that differ in what all must have in common."""
         count = len(navigations)
         worlds = _spread(NOMINAL if world is None else world, count, read_world)
         self._worlds = [

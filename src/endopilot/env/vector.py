@@ -215,12 +215,8 @@ class NavigateVectorEnv(VectorEnv):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every world, or in those of `options["reset_mask"]`, a boolean for each.
 
-        Args:
-            seed: world i draws from seed + i, or from its own; without one the generators go on.
-            options: `reset_mask` or none.
-
-        Raises:
-            InputError: another option, or a mask of another shape.
+        World i draws from seed + i, or from its own; without a seed the generators go on. InputError for another
+        option, or a mask of another shape.
         """
         refuse_options(options, "reset_mask")
         mask = np.asarray((options or {}).get("reset_mask", self._everyone), dtype=bool)
@@ -244,12 +240,9 @@ class NavigateVectorEnv(VectorEnv):
         Bool[np.ndarray, "worlds"],
         dict[str, Any],
     ]:
-        """Drive every world for a control period, by a row of actions each.
-
-        Raises:
-            ResetNeeded: a world has not been reset, or its episode has ended and nothing resets it by itself.
-            InputError: actions of another shape, or not finite; no world is moved in either case.
-        """
+        """Drive every world for a control period, by a row of actions each. `ResetNeeded` is raised where a world has
+        not been reset, or its episode has ended and nothing resets it by itself, and InputError for actions of another
+        shape or not finite; no world is moved then."""
         mode, episodes = self.metadata["autoreset_mode"], self._episodes
         over = (episodes.steps < 0) | (episodes.ended & (mode is AutoresetMode.DISABLED))
         if over.any():
@@ -284,7 +277,10 @@ class NavigateVectorEnv(VectorEnv):
         return observations, *judged, infos
 
     def _now(self, step: Step | None = None) -> Measured:
-        return Measured.of(self._simulator, self._reality.encoders, self._episodes.routes, step)
+        simulator, tip = self._simulator, self._simulator.project()
+        force = simulator.contacts.max(axis=1) if step is None else step.contact_force_max
+        distance_mm = self._episodes.routes.distance(tip)
+        return Measured(step or simulator, force, tip, distance_mm, self._reality.encoders)
 
     def _expose(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         if self._c_arms is not None:
@@ -328,11 +324,7 @@ class NavigateVectorEnv(VectorEnv):
         return NavigationState(self._simulator.state, copy.deepcopy(kept))
 
     def set_state(self, state: NavigationState) -> None:
-        """Go back to a state, bit by bit.
-
-        Raises:
-            InputError: it is that of other navigations or settings.
-        """
+        """Go back to a state, bit by bit; InputError for that of other navigations or settings."""
         self._simulator.set_state(state.simulator)
         kept = copy.deepcopy(state.kept)
         self._reality.drawn = kept["drawn"]

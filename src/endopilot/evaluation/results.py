@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,28 +112,26 @@ class SplitResult:
         return ~(np.isfinite(tip.abscissa) & np.isfinite(tip.offset))
 
 
-_MAPPINGS = ("controls", "tip_distance")
-_TIP_FIELDS = ("abscissa", "offset", "radius")
+def _flat(value: Any, name: str) -> dict[str, np.ndarray]:
+    """Return the arrays in records and mappings, by the names on the way to them with "/" between."""
+    if not isinstance(value, Mapping | SplitResult | TipSeries):
+        return {name: np.asarray(value)}
+    parts = value if isinstance(value, Mapping) else vars(value)
+    return {
+        key: array for part, of in parts.items() for key, array in _flat(of, f"{name}/{part}" if name else part).items()
+    }
 
 
 def write_results(results: Mapping[str, SplitResult], path: Path) -> None:
     """Write the results of all splits as one .npz, keys "split/field" or "split/field/series", whole or not at all."""
-    arrays: dict[str, np.ndarray] = {}
-    for split, result in results.items():
-        for name in ("sample_period_s", "anatomies", "anatomy", "sequence", "wire_radius_mm", "true_control"):
-            arrays[f"{split}/{name}"] = np.asarray(getattr(result, name))
-        for series, tip in {"true": result.true, **result.tips}.items():
-            arrays |= {f"{split}/tips/{series}/{name}": getattr(tip, name) for name in _TIP_FIELDS}
-        for name in _MAPPINGS:
-            arrays |= {f"{split}/{name}/{series}": values for series, values in getattr(result, name).items()}
     with writing(path) as partial, partial.open("wb") as stream:
         # As keywords the keys would have to be identifiers for the type checker only; numpy takes any name.
-        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(stream, **_flat(results, ""))  # pyright: ignore[reportArgumentType]
 
 
 def read_results(path: Path) -> dict[str, SplitResult]:
     """Read what `write_results` wrote; InputError if it is missing or damaged."""
-    path = regular(path)
+    path, nested = regular(path), dict[str, Any]()
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file.items())
@@ -140,28 +139,23 @@ def read_results(path: Path) -> dict[str, SplitResult]:
         raise InputError(f"{path}: no such file; run `endopilot evaluate` first") from error
     except Exception as error:  # numpy raises many kinds on a damaged archive
         raise InputError(f"{path}: damaged ({error}); run `endopilot evaluate` again") from error
+    for key, array in arrays.items():
+        *way, last = key.split("/")
+        functools.reduce(lambda parts, part: parts.setdefault(part, {}), way, nested)[last] = array
     with reading(path, "run `endopilot evaluate` again"):
-        return {split: _read_split(arrays, split) for split in dict.fromkeys(key.split("/")[0] for key in arrays)}
+        return {split: _read_split(**fields) for split, fields in nested.items()}
 
 
-def _read_split(arrays: Mapping[str, np.ndarray], split: str) -> SplitResult:
-    def below(name: str) -> dict[str, np.ndarray]:
-        prefix = f"{split}/{name}/"
-        return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
-
-    tip_arrays = below("tips")
-    series = dict.fromkeys(key.split("/")[0] for key in tip_arrays)
-    tips = {name: TipSeries(**{field: tip_arrays[f"{name}/{field}"] for field in _TIP_FIELDS}) for name in series}
+def _read_split(
+    *, anatomies: Any, sample_period_s: Any, wire_radius_mm: Any, true: Any, tips: Any, **arrays: Any
+) -> SplitResult:
     return SplitResult(
-        sample_period_s=float(arrays[f"{split}/sample_period_s"]),
-        anatomies=tuple(str(name) for name in arrays[f"{split}/anatomies"]),
-        anatomy=arrays[f"{split}/anatomy"],
-        sequence=arrays[f"{split}/sequence"],
-        wire_radius_mm=float(arrays[f"{split}/wire_radius_mm"]),
-        true=tips.pop("true"),
-        true_control=arrays[f"{split}/true_control"],
-        tips=tips,
-        **{name: below(name) for name in _MAPPINGS},
+        sample_period_s=float(sample_period_s),
+        anatomies=tuple(map(str, anatomies)),
+        wire_radius_mm=float(wire_radius_mm),
+        true=TipSeries(**true),
+        tips={name: TipSeries(**fields) for name, fields in tips.items()},
+        **arrays,
     )
 
 
@@ -272,14 +266,6 @@ def _gap(known: float | None, new: float | None) -> dict[str, float | None]:
     return {"difference": new - known, "ratio": new / known if known else None}
 
 
-BASELINE_WORDS: Mapping[str, str] = {
-    "hold_slack": "holding slack and offset",
-    "training_mean": "the training mean",
-    "hold_control": "holding the last control",
-    "follow_slack": "driving by the held slack",
-}
-
-
 def findings(metrics: Mapping[str, Any]) -> list[str]:
     """Return in words, from the numbers alone, where the networks beat their baselines and where they lose."""
     sentences = []
@@ -313,4 +299,4 @@ def _verdict(skills: Mapping[str, float | None], symbol: str) -> str:
         return ""
     hardest = min(known, key=lambda name: known[name])
     verdict = "beats every baseline" if known[hardest] > 0 else "loses to a baseline"
-    return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {BASELINE_WORDS[hardest]})"
+    return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {SERIES_TITLES[hardest].lower()})"

@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from endopilot.errors import place_text
 from endopilot.imaging.aortic_root import box_around, openings
-from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.imaging.vessel_tracking import CALCIUM
 from endopilot.lines import length_along
 from endopilot.types import Volume
 

@@ -22,7 +22,7 @@ from pydicom.uid import UID, AllTransferSyntaxes
 
 from endopilot.errors import InputError
 from endopilot.imaging.dicom_phases import PHASE_TAGS, choose_phase, slices_text
-from endopilot.imaging.geometry import Geometry, plane, slice_grid
+from endopilot.imaging.geometry import plane, slice_grid
 from endopilot.progress import progress
 from endopilot.types import Volume
 
@@ -122,9 +122,9 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
     )
     ordered, place = _geometry([chosen[index] for index in of_phase], axes, normal, folder)
     voxels, pixel_notes = _read_pixels(ordered)
-    volume = place.volume(voxels, tuple(sorted(slice_.path for slice_ in ordered)))
     said = tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes))
-    return replace(volume, notes=(*said, *volume.notes))
+    files = tuple(sorted(slice_.path for slice_ in ordered))
+    return replace(place, voxels=voxels, notes=(*said, *place.notes), files=files)
 
 
 def _files(folder: Path, *, deep: bool) -> list[Path]:
@@ -290,7 +290,7 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
 
 def _geometry(
     slices: Sequence[_Slice], axes: Float[np.ndarray, "3 2"], normal: Float[np.ndarray, "3"], folder: Path
-) -> tuple[list[_Slice], Geometry]:
+) -> tuple[list[_Slice], Volume]:
     """Return slices in order, and where they lie (DICOM PS3.3 C.7.6.2.1.1); gaps are refused."""
     positions = np.array([slice_.numbers["ImagePositionPatient"] for slice_ in slices])
     order = np.argsort(positions @ normal, kind="stable")
@@ -305,7 +305,7 @@ def _geometry(
             "slices are missing; export the whole series again"
         )
     spacing, size = slices[0].numbers["PixelSpacing"], slices[0].size
-    place = slice_grid(positions[order], np.arange(len(slices)), axes, spacing, size, path=folder)
+    place = slice_grid(positions[order], axes, spacing, size, path=folder)
     return [slices[i] for i in order], place
 
 

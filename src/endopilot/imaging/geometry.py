@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 
 from endopilot.errors import InputError
 from endopilot.types import Volume
@@ -28,84 +28,60 @@ def require(good: object, path: Path, said: str) -> None:
         raise InputError(f"{path}: {said}")
 
 
-@dataclass(frozen=True)
-class Fields:
-    """What a format calls the parts of its geometry, for messages."""
-
-    direction: str
-    spacing: str
-    origin: str
-
-
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """Where voxels lie, as in `Volume` (mm, LPS), and a sentence for each change made to the header's numbers."""
-
-    spacing_mm: Float[np.ndarray, "3"]
-    origin_mm: Float[np.ndarray, "3"]
-    direction: Float[np.ndarray, "3 3"]
-    notes: tuple[str, ...]
-
-    def volume(self, voxels: Shaped[np.ndarray, "nz ny nx"], files: tuple[Path, ...]) -> Volume:
-        """Return voxels at this place, read from `files`."""
-        return Volume(voxels, self.spacing_mm, self.origin_mm, self.direction, self.notes, files)
-
-
-def geometry(
+def placed(
+    voxels: Shaped[np.ndarray, "nz ny nx"],
     direction: Float[np.ndarray, "3 3"],
     spacing_mm: Float[np.ndarray, "3"],
     origin_mm: Float[np.ndarray, "3"],
-    size: tuple[int, int, int],
     *,
     path: Path,
-    fields: Fields,
-) -> Geometry:
-    """Return the geometry of an image of `size` (i, j, k), its axes (columns of `direction`) straightened to the
-    nearest rotation about its centre. Raises InputError, which names the header's `fields`, for what is no such
-    geometry."""
-    for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
+    fields: tuple[str, str, str],
+    notes: tuple[str, ...] = (),
+    files: tuple[Path, ...] = (),
+) -> Volume:
+    """Return voxels where a header puts them, its axes (columns of `direction`) straightened to the nearest rotation
+    about the volume's centre, and noted. `fields` are the format's names of direction, spacing and origin. Raises
+    InputError, which names them, for what is no such geometry."""
+    for name, values in zip(fields, (direction.T, spacing_mm, origin_mm), strict=True):
         shown = " ".join(f"{value:g}" for value in np.ravel(values))
         require(np.isfinite(values).all(), path, f"{name} holds {shown}, which is not finite; export it again")
-    small = f"{fields.spacing} gives voxels of {lengths_text(spacing_mm)} mm; export it again"
+    small = f"{fields[1]} gives voxels of {lengths_text(spacing_mm)} mm; export it again"
     require(spacing_mm.min() > 0, path, small)
     lengths = np.linalg.norm(direction, axis=0)
-    long = f"{fields.direction} holds axes of length {lengths_text(lengths)}, which must be 1; export it again"
+    long = f"{fields[0]} holds axes of length {lengths_text(lengths)}, which must be 1; export it again"
     require(np.abs(lengths - 1.0).max() < AXES_TOLERANCE, path, long)
     axes = direction / lengths
     skew = float(np.abs(axes.T @ axes - np.eye(3)).max())
     off = f"off by {np.degrees(np.arcsin(min(skew, 1.0))):.2g}°: a sheared image or a gantry tilt"
-    sheared = f"{fields.direction}: its axes are not at right angles ({off}); resample it to straight slices"
+    sheared = f"{fields[0]}: its axes are not at right angles ({off}); resample it to straight slices"
     require(skew < AXES_TOLERANCE, path, sheared)
     left, _, right = np.linalg.svd(axes)
-    straight = left @ right
     # 0 - 0 and not -0: the axes of an upright volume stay the plain numbers that they are.
-    straight = axes if skew < 1e-12 else straight
+    straight = axes if skew < 1e-12 else left @ right
     error = max(skew, float(np.abs(lengths - 1.0).max()))
     if error < _ROUNDING:
-        return Geometry(spacing_mm, origin_mm, straight, ())
-    last = np.array(size, dtype=float) - 1.0
-    origin = origin_mm + (direction - straight) @ (spacing_mm * last / 2.0)
-    straightened = Geometry(spacing_mm, origin, straight, ())
-    moved = farthest_apart_mm(Geometry(spacing_mm, origin_mm, direction, ()), straightened, size)
+        return Volume(voxels, spacing_mm, origin_mm, straight, notes, files)
+    origin = origin_mm + (direction - straight) @ (spacing_mm * (np.array(voxels.shape[::-1], dtype=float) - 1.0) / 2.0)
+    straightened = Volume(voxels, spacing_mm, origin, straight)
+    moved = farthest_apart_mm(Volume(voxels, spacing_mm, origin_mm, direction), straightened)
     note = (
-        f"{path.name}: the axes in {fields.direction} are off unit vectors at right angles by {error:.2g}; they were "
+        f"{path.name}: the axes in {fields[0]} are off unit vectors at right angles by {error:.2g}; they were "
         f"straightened, which moved voxels by up to {moved:.2g} mm"
     )
-    return replace(straightened, notes=(note,))
+    return replace(straightened, notes=(*notes, note), files=files)
 
 
 def parted(steps_mm: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return directions and lengths of a header's steps along i, j and k; `geometry` refuses one without length."""
+    """Return directions and lengths of a header's steps along i, j and k; `placed` refuses one without length."""
     lengths = np.linalg.norm(steps_mm, axis=0)
     with np.errstate(invalid="ignore"):
         return steps_mm / np.where(lengths > 0, lengths, 1.0), lengths
 
 
-def farthest_apart_mm(one: Geometry | Volume, other: Geometry | Volume, size: Sequence[int]) -> float:
-    """Return how far two grids of one size (along i, j and k) put the same voxel apart at most, mm."""
-    corners = np.array(list(itertools.product(*((0.0, extent - 1.0) for extent in size))))
-    first, second = (g.origin_mm + (corners * g.spacing_mm) @ g.direction.T for g in (one, other))
-    return float(np.linalg.norm(first - second, axis=1).max())
+def farthest_apart_mm(one: Volume, other: Volume) -> float:
+    """Return how far two grids of one size put the same voxel apart at most, mm."""
+    corners = np.array(list(itertools.product(*((0.0, extent - 1.0) for extent in one.voxels.shape[::-1]))))
+    return float(np.linalg.norm(one.index_to_world(corners) - other.index_to_world(corners), axis=1).max())
 
 
 def plane(
@@ -117,40 +93,40 @@ def plane(
     normal = np.cross(axes[:, 0], axes[:, 1])
     length = float(np.linalg.norm(normal))
     normal = normal / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
-    sizes, fields = np.array([*spacing_mm[::-1], 1.0]), Fields("ImageOrientationPatient", "PixelSpacing", "")
-    geometry(np.column_stack([axes, normal]), sizes, np.zeros(3), (1, 1, 1), path=path, fields=fields)
+    turned, sizes = np.column_stack([axes, normal]), np.array([*spacing_mm[::-1], 1.0])
+    fields = "ImageOrientationPatient", "PixelSpacing", ""
+    placed(np.zeros((1, 1, 1)), turned, sizes, np.zeros(3), path=path, fields=fields)
     return axes, normal
 
 
 def slice_grid(
     positions: Float[np.ndarray, "n 3"],
-    slots: Int[np.ndarray, "n"],
     axes: Float[np.ndarray, "3 2"],
     spacing_mm: Sequence[float],
     size: tuple[int, int],
     *,
     path: Path,
-) -> Geometry:
-    """Return where the voxels of parallel slices of `size` (Rows, Columns) lie (DICOM PS3.3 C.7.6.2.1.1). Bounded is
-    how far each lies from its place in the even grid, not the step, whose errors add up; `slots` number the slices from
-    0. Raises InputError for uneven steps or a slant."""
-    first, last = positions[slots.argmin()], positions[slots.argmax()]
-    travel = (last - first) / slots.max()
+) -> Volume:
+    """Return the volume, still empty, of parallel slices of `size` (Rows, Columns; DICOM PS3.3 C.7.6.2.1.1). Bounded is
+    how far each lies from its place in the even grid, not the step, whose errors add up. Raises InputError for uneven
+    steps or a slant."""
+    first, slots = positions[0], np.arange(len(positions))
+    travel = (positions[-1] - first) / slots[-1]
     step = float(np.linalg.norm(travel))
     off = np.linalg.norm(positions - first - slots[:, None] * travel, axis=1)
     worst = int(off.argmax())
-    uneven = f"slice {slots[worst] + 1} lies {off[worst]:.2f} mm from where even steps of {step:.2f} mm put it"
+    uneven = f"slice {worst + 1} lies {off[worst]:.2f} mm from where even steps of {step:.2f} mm put it"
     mend = "export the series again, or resample it to even steps"
     require(
         off[worst] <= _PLACE_TOLERANCE * step, path, f"ImagePositionPatient are not evenly spaced: {uneven}; {mend}"
     )
-    return geometry(
+    return placed(
+        np.broadcast_to(np.int16(0), (len(positions), *size)),
         np.column_stack([axes, travel / step]),
         np.array([*spacing_mm[::-1], step]),
         first,
-        (size[1], size[0], int(slots.max()) + 1),
         path=path,
-        fields=Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
+        fields=("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient"),
     )
 
 

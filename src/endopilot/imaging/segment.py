@@ -137,7 +137,7 @@ def _refuse_no_mask(mask: object, volume: Volume, name: str) -> None:
             f"method: {name!r} returned {voxels.dtype} voxels of shape {voxels.shape}; return bool voxels on the "
             f"volume's grid, {volume.voxels.shape}"
         )
-    apart = farthest_apart_mm(mask.volume, volume, voxels.shape[::-1])
+    apart = farthest_apart_mm(mask.volume, volume)
     if not apart < volume.spacing_mm.min() / 2:  # nor NaN
         raise InputError(
             f"method: {name!r} returned a mask on another grid, up to {apart:.3g} mm from the volume's; return it with "

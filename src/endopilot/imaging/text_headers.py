@@ -5,20 +5,19 @@ https://itk.org/Wiki/MetaIO/Documentation), where RAI are axes from right, anter
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
-from endopilot.errors import InputError
-from endopilot.imaging.geometry import Fields, Geometry, geometry, parted, require
+from endopilot.imaging.geometry import parted, placed, require
 from endopilot.imaging.segments import ImageFile, Segment
 from endopilot.imaging.voxels import read_voxels_beside
 
-_LONGEST_HEADER = 1 << 20
+_LONGEST_LINE = 1 << 20
 _NOT_SUCH = "its content does not match its suffix, or its header is damaged; export it again"
 _NO_END = "truncated or damaged (its header does not end); copy or export it again"
 _SPACES = {
@@ -27,267 +26,186 @@ _SPACES = {
     **dict.fromkeys(("left-posterior-superior", "lps"), (1.0, 1.0, 1.0)),
 }
 """The patient's axes that NRRD defines, and the signs that turn them to LPS."""
+_BYTES = {"char": 1, "short": 2, "int": 4, "long": 4, "longlong": 8, "int8": 1, "int16": 2, "int32": 4, "int64": 8}
+"""Of whole numbers, without what says that they have no sign; MetaImage's `long` has four."""
+_SIZES, _TRUTH = r"[1-9]\d{0,11}( +[1-9]\d{0,11})*", "[tf10].*"
 
-_NRRD_TYPES = {
-    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
-    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
-    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
-    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
-    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
-    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
-    **dict.fromkeys(
-        ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"), "i8"
-    ),
-    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
-    "float": "f4",
-    "double": "f8",
-}
-_PACKED = {"raw": False, "gzip": True, "gz": True}
-_NRRD_SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
-_NRRD_FIELDS = Fields("space directions", "space directions", "space origin")
 
-_LONGEST_LINE = 1 << 16
-_MOST_LINES = 1000
-_META_TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
-_META_SYNONYMS = {
-    **dict.fromkeys(("Orientation", "Rotation"), "TransformMatrix"),
-    **dict.fromkeys(("Origin", "Position"), "Offset"),
-    "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
-}
-_META_FIELDS = Fields("TransformMatrix", "ElementSpacing", "Offset")
+@dataclass(frozen=True)
+class _Format:
+    """How a header is written: what parts a field's name from its value, other names of fields, and of each field that
+    is checked a regular expression, its value where it is missing (None: it must be there), and what it should say."""
+
+    sign: str
+    synonyms: Mapping[str, str]
+    rules: Mapping[str, tuple[str, str | None, str]]
+
+
+_NRRD = _Format(
+    ": |:=",
+    {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"},
+    {
+        "dimension": (r"\d{1,9}", None, "the number of axes"),
+        "sizes": (_SIZES, None, "the number of voxels along each axis"),
+        "type": ("[a-z].*", None, "a type of numbers"),
+        "encoding": ("raw|gzip|gz", None, "raw or gzip"),
+        "endian": ("little|big|", "", "little or big"),
+        "space": ("|".join(_SPACES), None, "an orientation in the patient, such as left-posterior-superior"),
+        "space directions": (r"((none|\([^()]*\))\s*)+", None, "one vector an axis"),
+        "space origin": (r"\(.*\)", None, "the place of the first voxel"),
+        "space units": (r'("(mm)?"\s*)+', '"mm"', "mm"),
+        "line skip": ("0", "0", "0"),
+        "byte skip": ("0", "0", "0"),
+    },
+)
+_META = _Format(
+    "=",
+    {
+        **dict.fromkeys(("Orientation", "Rotation"), "TransformMatrix"),
+        **dict.fromkeys(("Origin", "Position"), "Offset"),
+        "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
+    },
+    {
+        "NDims": (r"\d{1,9}", None, "the number of axes"),
+        "DimSize": (_SIZES, None, "the number of voxels along each axis"),
+        "ElementSpacing": (".+", None, "the size of a voxel"),
+        "ElementNumberOfChannels": ("1", "1", "1: give a grey-level volume, not colour or vectors"),
+        "ElementType": ("MET_.*", None, "a type of numbers"),
+        "HeaderSize": ("0", "0", "0"),
+        "BinaryData": ("t.*|1.*", "True", "True"),
+        "BinaryDataByteOrderMSB": (_TRUTH, "False", "True or False"),
+        "CompressedData": (_TRUTH, "False", "True or False"),
+        "DistanceUnits": ("mm", "mm", "mm"),
+    },
+)
+
+
+def _header(stream: BufferedIOBase, form: _Format, end: str, path: Path) -> dict[str, str]:
+    """Return the fields of a header, checked, and leave the stream behind the one that is its `end`, or behind an empty
+    line where that has no name. NRRD's keys (name:=value) stand among the fields as ":name"."""
+    fields: dict[str, str] = {}
+    for line in iter(lambda: stream.readline(_LONGEST_LINE), b""):
+        text = line.decode("utf-8", errors="replace").strip()
+        if not text and not end:
+            break
+        if not text or text.startswith("#"):
+            continue
+        name, sign, value = (*re.split(f"({form.sign})", f"{text} ", maxsplit=1), "", "")[:3]
+        name = f":{name}" if sign == ":=" else name.strip().lower() if not end else name.strip()
+        name = form.synonyms.get(name, name)
+        require(fields or not end or (sign and name.isidentifier()), path, _NOT_SUCH)
+        damaged = f"its header is damaged ({text[:60]!r} is no field of its own); export it again"
+        require(sign and name and name not in fields, path, damaged)
+        fields[name] = value.strip()
+        if name == end:
+            break
+    else:
+        require(not end and "data file" in fields, path, _NO_END)
+    for name, (pattern, absent, meant) in form.rules.items():
+        value = fields.setdefault(name, absent or "") if absent is not None else fields.get(name)
+        require(value is not None, path, f"has no {name}, which says {meant}; export it again")
+        good = re.fullmatch(pattern, value or "", re.IGNORECASE | re.DOTALL)
+        require(good, path, f"{name} {(value or '')[:60]!r} is not {meant}; export it again")
+    return fields
 
 
 def read_nrrd(path: Path) -> ImageFile:
     """Read an NRRD file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
-        fields, keys = _nrrd_header(stream, path)
-        sizes, vectors = _axes(fields, path)
-        domain = [axis for axis, vector in enumerate(vectors) if vector is not None]
-        place = _nrrd_geometry(fields, vectors, tuple(sizes[axis] for axis in domain), path)
-        segments = _segments(keys, path)
-        extra = [axis for axis in range(len(sizes)) if axis not in domain]
-        count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
-        kinds = dict(enumerate(fields.get("kinds", "").lower().split()))
-        lasting = len(extra) > 1 or any(kinds.get(axis) in ("list", "time") for axis in extra)
-        what = f"{len(sizes)}-D ({'×'.join(map(str, sizes))}); give one 3-D volume, such as one cardiac phase"
-        what = what if lasting else f"{count} values in every voxel (colour or vectors); give a grey-level volume"
-        require(count <= 1 or segments, path, what)
-        values, files = _values(fields, sizes, stream.read(), path)
+        require(re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)), path, _NOT_SUCH)
+        fields = _header(stream, _NRRD, "", path)
+        rest = stream.read()
+    sizes = [int(word) for word in fields["sizes"].split()]
+    words = re.findall(r"none|\([^()]*\)", fields["space directions"].lower())
+    unlike = "its dimension, sizes and space directions are not of as many axes; export it again"
+    require(int(fields["dimension"]) == len(sizes) == len(words), path, unlike)
+    domain = [axis for axis, word in enumerate(words) if word != "none"]
+    extra = [axis for axis in range(len(sizes)) if axis not in domain]
+    shape = "×".join(map(str, sizes))
+    flat = f"{shape} voxels with {len(domain)} axes in space are no volume; give a 3-D volume"
+    require(len(domain) == 3, path, flat)
+    segments = _segments(fields, path)
+    count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
+    kinds = dict(enumerate(fields.get("kinds", "").lower().split()))
+    lasting = len(extra) > 1 or any(kinds.get(axis) in ("list", "time") for axis in extra)
+    what = f"{count} values in every voxel (colour or vectors); give a grey-level volume"
+    what = f"{len(sizes)}-D ({shape}); give one 3-D volume, such as one cardiac phase" if lasting else what
+    require(count <= 1 or segments, path, what)
+    order, packed = fields["endian"], fields["encoding"].lower() != "raw"
+    dtype = _type(fields, "type", order.lower() == "big", path)
+    require(order or dtype.itemsize == 1, path, "has no endian, which says little or big; export it again")
+    beside = fields.get("data file")
+    values, files = read_voxels_beside(beside, rest, dtype, sizes[::-1], packed=packed, header=path)
     # The first axis of the file is the fastest, and so the last of the array.
-    order = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
-    layers = values.transpose(order).reshape(count, *(sizes[axis] for axis in reversed(domain)))
-    return ImageFile(place.volume(layers[0], files), layers, segments)
+    axes = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
+    layers = values.transpose(axes).reshape(count, *(sizes[axis] for axis in reversed(domain)))
+    to_lps = np.array(_SPACES[fields["space"].lower()])
+    steps = np.array([_vector(words[axis], "space directions", path) for axis in domain]).T
+    origin = to_lps * _vector(fields["space origin"], "space origin", path)
+    named = "space directions", "space directions", "space origin"
+    place = placed(layers[0], *parted(to_lps[:, None] * steps), origin, path=path, fields=named, files=files)
+    return ImageFile(place, layers, segments)
 
 
-def _nrrd_header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return fields and keys of a header, and leave the stream at the byte after its empty line."""
-    require(re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)), path, _NOT_SUCH)
-    fields: dict[str, str] = {}
-    keys: dict[str, str] = {}
-    while line := stream.readline(_LONGEST_HEADER):
-        text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-        if not text:
-            return fields, keys
-        if text.startswith("#"):
-            continue
-        key, sign, value = text.partition(":=")
-        field, colon, description = text.partition(": ")
-        if sign and len(key) < len(field):
-            keys[key] = value
-            continue
-        name = field.strip().lower()
-        name = _NRRD_SYNONYMS.get(name, name)
-        damaged = f"its header is damaged ({text[:60]!r} is no field of its own); export it again"
-        require(colon and name and name not in fields, path, damaged)
-        fields[name] = description.strip()
-        if name == "data file" and fields[name].split()[:1] == ["LIST"]:
-            return fields, keys
-    require("data file" in fields, path, _NO_END)
-    return fields, keys
-
-
-def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[Float[np.ndarray, "3"] | None]]:
-    """Return the size of every axis and the step along each, None but for three that run through space."""
-    try:
-        sizes = [int(word) for word in fields.get("sizes", "").split()]
-        dimension = int(fields.get("dimension", ""))
-    except ValueError:
-        sizes, dimension = [], 0
-    whole = dimension == len(sizes) and min(sizes, default=0) >= 1
-    require(whole, path, "its dimension and sizes describe no image; export it again")
-    nowhere = "has no orientation (no space in its header); export it with its space directions"
-    require("space" in fields, path, nowhere)
-    text = fields.get("space directions", "")
-    words = re.findall(r"none|\([^()]*\)", text)
-    vectors = [None if word == "none" else _vector(word, "space directions", path) for word in words]
-    one_each = len(words) == len(sizes) and not re.sub(r"none|\([^()]*\)", "", text).strip()
-    require(one_each, path, f"space directions {text[:80]!r} are not one vector an axis; export it again")
-    count = sum(vector is not None for vector in vectors)
-    flat = f"{'×'.join(map(str, sizes))} voxels with {count} axes in space are no volume; give a 3-D volume"
-    require(count == 3, path, flat)
-    return sizes, vectors
-
-
-def _nrrd_geometry(
-    fields: dict[str, str], vectors: list[Float[np.ndarray, "3"] | None], size: tuple[int, ...], path: Path
-) -> Geometry:
-    space = fields["space"]
-    where = f"space {space[:40]!r} does not say where the patient's left, back and head are"
-    require(space.lower() in _SPACES, path, f"{where}; export it in left-posterior-superior")
-    to_lps = np.array(_SPACES[space.lower()])
-    nowhere = "has no place (no space origin in its header); export it with its space origin"
-    require("space origin" in fields, path, nowhere)
-    origin = _vector(fields["space origin"], "space origin", path)
-    steps = np.array([vector for vector in vectors if vector is not None]).T
-    units = fields.get("space units", "").lower()
-    in_mm = set(re.findall(r'"([^"]*)"', units)) <= {"", "mm"} and ("space units" not in fields or '"' in units)
-    require(in_mm, path, f"space units {units[:60]!r} are not mm; export it in mm")
-    lengths = np.linalg.norm(steps, axis=0)
-    along = zip(fields.get("spacings", "").split(), vectors, strict=False)
-    given = [word for word, vector in along if vector is not None and word.lower() != "nan"]
-    same = not given or np.allclose(_numbers(given, 3, "spacings", path), lengths, rtol=1e-2)
-    require(same, path, f"spacings {' '.join(given)} contradict space directions; export it again")
-    steps, origin = to_lps[:, None] * steps, to_lps * origin
-    return geometry(*parted(steps), origin, (size[0], size[1], size[2]), path=path, fields=_NRRD_FIELDS)
-
-
-def _values(
-    fields: dict[str, str], sizes: list[int], rest: bytes, path: Path
-) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
-    kind, encoding, endian = (fields.get(name, "") for name in ("type", "encoding", "endian"))
-    dtype, packed = _NRRD_TYPES.get(kind.lower(), ""), _PACKED.get(encoding.lower())
-    require(dtype, path, f"type {kind.lower()!r} holds no grey levels; export it as short or float")
-    require(packed is not None, path, f"encoding {encoding!r} is not read; export it as raw or gzip")
-    for name in ("line skip", "byte skip"):
-        skipped = fields.get(name, "0")
-        require(skipped == "0", path, f"{name} {skipped[:20]!r} is not read; export it again")
-    odd = f"endian {endian.lower()!r} is neither little nor big; export it again"
-    require(endian.lower() in ("little", "big") or dtype[1] == "1", path, odd)
-    order = ">" if endian.lower() == "big" else "<"
-    return read_voxels_beside(
-        fields.get("data file"), rest, np.dtype(order + dtype), sizes[::-1], packed=bool(packed), header=path
-    )
-
-
-def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
+def _segments(fields: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
     """Return the segments that 3D Slicer names in a header; before layers, each had a layer of its own."""
-    numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d{1,6})_(?:ID|Name)$", key))})
+    numbers = sorted({int(found[1]) for key in fields if (found := re.match(r":Segment(\d{1,6})_(?:ID|Name)$", key))})
     segments = []
     for place, number in enumerate(numbers):
-        value, layer = (keys.get(f"Segment{number}_{part}", "") for part in ("LabelValue", "Layer"))
+        value, layer, name, own = (
+            fields.get(f":Segment{number}_{part}", "") for part in ("LabelValue", "Layer", "Name", "ID")
+        )
         whole = re.fullmatch(r"\d{0,9} \d{0,9}", f"{value} {layer}")
         require(whole, path, f"Segment{number} has no whole numbers as LabelValue and Layer; export it again")
-        name = keys.get(f"Segment{number}_Name") or keys.get(f"Segment{number}_ID", "")
         plain = not value and not layer
-        segments.append(Segment(name, place if plain else int(layer or 0), int(value or 1)))
+        segments.append(Segment(name or own, place if plain else int(layer or 0), int(value or 1)))
     return tuple(segments)
 
 
 def read_metaimage(path: Path) -> ImageFile:
     """Read a MetaImage file. Raises InputError if it is damaged, holds no grey levels or labels, or tells no place."""
     with path.open("rb") as stream:
-        fields = _meta_header(stream, path)
-        size = _meta_size(fields, path)
-        place = _meta_geometry(fields, size, path)
-        dtype, packed = _meta_encoding(fields, path)
-        source = fields["ElementDataFile"]
-        beside = None if source.upper() == "LOCAL" else source
-        voxels, files = read_voxels_beside(beside, stream.read(), dtype, size[::-1], packed=packed, header=path)
-    return ImageFile(place.volume(voxels, files), voxels[None])
-
-
-def _meta_header(stream: BufferedIOBase, path: Path) -> dict[str, str]:
-    """Return the fields of a header, and leave the stream at the byte after it."""
-    fields: dict[str, str] = {}
-    for _ in range(_MOST_LINES):
-        line = stream.readline(_LONGEST_LINE)
-        name, sign, value = line.decode("utf-8", errors="replace").partition("=")
-        name = _META_SYNONYMS.get(name.strip(), name.strip())
-        if line and not line.strip():
-            continue
-        require(fields or (sign and name.isidentifier()), path, _NOT_SUCH)
-        damaged = f"its header is damaged ({name[:40]!r} is no field of its own); export it again"
-        require(sign and name and name not in fields, path, damaged)
-        fields[name] = value.strip()
-        if name == "ElementDataFile":
-            return fields
-    raise InputError(f"{path}: {_NO_END}")
-
-
-def _meta_size(fields: dict[str, str], path: Path) -> tuple[int, int, int]:
-    try:
-        extents = [int(word) for word in fields.get("DimSize", "").split()]
-        count, channels = int(fields.get("NDims", "")), int(fields.get("ElementNumberOfChannels", "1"))
-    except ValueError:
-        extents, count, channels = [], 0, 1
-    whole = count == len(extents) and min(extents, default=0) >= 1
-    require(whole, path, "its NDims and DimSize describe no image; export it again")
-    colour = f"{channels} values in every voxel (colour or vectors); give a grey-level volume"
-    require(channels == 1, path, colour)
+        fields = _header(stream, _META, "ElementDataFile", path)
+        rest = stream.read()
+    extents, count = [int(word) for word in fields["DimSize"].split()], int(fields["NDims"])
+    require(count == len(extents), path, "its NDims and DimSize describe no image; export it again")
     shape = "×".join(map(str, extents))
     several = f"{count}-D ({shape}); give a single 3-D volume, such as one cardiac phase"
     require(max(extents[3:], default=1) == 1, path, several)
     require(count >= 3, path, f"{shape} voxels are no volume; give a 3-D volume")
-    return extents[0], extents[1], extents[2]
-
-
-def _meta_encoding(fields: dict[str, str], path: Path) -> tuple[np.dtype, bool]:
-    """Return the voxels' type, and whether they are packed."""
-    kind = fields.get("ElementType", "")
-    none = f"ElementType {kind[:40]!r} holds no grey levels; export it as MET_SHORT or MET_FLOAT"
-    require(kind in _META_TYPES, path, none)
-    plain = fields.get("HeaderSize", "0") == "0" and _truth(fields, "BinaryData", True, path)
-    require(plain, path, "HeaderSize, or text in place of BinaryData, is not read; export it again")
-    big = _truth(fields, "BinaryDataByteOrderMSB", False, path)
-    return np.dtype((">" if big else "<") + _META_TYPES[kind]), _truth(fields, "CompressedData", False, path)
-
-
-def _truth(fields: dict[str, str], name: str, default: bool, path: Path) -> bool:
-    text = fields.get(name, str(default))
-    require(
-        re.match("[TF10]", text, re.IGNORECASE),
-        path,
-        f"{name} {text[:20]!r} is neither True nor False; export it again",
-    )
-    return text[:1].upper() in ("T", "1")
-
-
-def _meta_geometry(fields: dict[str, str], size: tuple[int, int, int], path: Path) -> Geometry:
-    count = int(fields["NDims"])
-    sizeless = "has no ElementSpacing, so that its voxels have no size; export it again"
-    require("ElementSpacing" in fields, path, sizeless)
+    big, packed = (fields[name][:1].lower() in "t1" for name in ("BinaryDataByteOrderMSB", "CompressedData"))
+    dtype, source = _type(fields, "ElementType", big, path), fields["ElementDataFile"]
+    beside = None if source.upper() == "LOCAL" else source
+    voxels, files = read_voxels_beside(beside, rest, dtype, extents[2::-1], packed=packed, header=path)
     spacing = _numbers(fields["ElementSpacing"].split(), count, "ElementSpacing", path)[:3]
-    unit, notes, origin = fields.get("DistanceUnits", "mm"), tuple[str, ...](), np.zeros(3)
-    require(unit.lower() == "mm", path, f"DistanceUnits {unit[:20]!r} is not mm; export it in mm")
+    origin, direction, notes = np.zeros(3), np.eye(3), tuple[str, ...]()
     if "Offset" in fields:
         origin = _numbers(fields["Offset"].split(), count, "Offset", path)[:3]
     else:
         notes += (f"{path.name}: has no Offset; its first voxel was put at 0 0 0",)
-    words = fields.get("AnatomicalOrientation", "RAI").strip().upper()
     if "TransformMatrix" in fields:
         # Its rows are the directions of i, j and k.
         rows = _numbers(fields["TransformMatrix"].split(), count * count, "TransformMatrix", path)
         direction = rows.reshape(count, count)[:3, :3].T
     else:
+        words = fields.get("AnatomicalOrientation", "RAI").upper()
         turned = f"AnatomicalOrientation {words[:20]} without a TransformMatrix; export it again"
         require(words in ("RAI", "???"), path, turned)
-        direction = np.eye(3)
         notes += (f"{path.name}: has no TransformMatrix; its axes were taken as left, posterior and superior",)
-    place = geometry(direction, spacing, origin, size, path=path, fields=_META_FIELDS)
-    return replace(place, notes=(*notes, *place.notes))
+    named = "TransformMatrix", "ElementSpacing", "Offset"
+    place = placed(voxels, direction, spacing, origin, path=path, fields=named, notes=notes, files=files)
+    return ImageFile(place, voxels[None])
+
+
+def _type(fields: Mapping[str, str], field: str, big: bool, path: Path) -> np.dtype:
+    """Return the type of a header's numbers, such as "unsigned short", "uint16_t" or MET_USHORT."""
+    plain = re.sub(r"^met_|_t$|^signed |[ _]", "", fields[field].lower().replace("unsigned ", "u"))
+    name = re.sub("(?<=[tg])int$", "", plain)
+    width, sign = _BYTES.get(name.removeprefix("u")), "u" if name.startswith("u") else "i"
+    kind = {"float": "f4", "double": "f8"}.get(name) or (f"{sign}{width}" if width else "")
+    said = f"{field} {fields[field][:40]!r} holds no grey levels; export it as short or float"
+    require(kind, path, said)
+    return np.dtype((">" if big else "<") + kind)
 
 
 def _numbers(words: Sequence[str], count: int, field: str, path: Path) -> Float[np.ndarray, "_"]:

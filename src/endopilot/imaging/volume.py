@@ -117,7 +117,7 @@ def _write_file(volume: Volume, partial: Path) -> None:
         again = _decoded(partial).volume
     except (RuntimeError, InputError) as error:
         raise OSError("its writer failed") from error
-    near = farthest_apart_mm(again, volume, volume.voxels.shape[::-1]) < volume.spacing_mm.min() / 2
+    near = farthest_apart_mm(again, volume) < volume.spacing_mm.min() / 2
     if not near or not np.array_equal(again.voxels, volume.voxels, equal_nan=True):
         raise OSError("what was written is not the volume")
 

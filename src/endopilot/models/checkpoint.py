@@ -33,11 +33,8 @@ def write_network(path: Path, name: str, network: Network, config: TransformerCo
 
 
 def read_network(path: Path) -> Network:
-    """Return a network that `write_network` wrote.
-
-    Raises:
-        InputError: the file is missing, damaged or of another version.
-    """
+    """Return a network that `write_network` wrote; InputError for a file that is missing, damaged or of another
+    version."""
     tensors, facts = read_tensors(path)
     try:
         network = NETWORKS[facts["network"]](TransformerConfig(**facts["size"]))
@@ -55,11 +52,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str,
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the tensors and the facts of a file that `write_tensors` wrote.
-
-    Raises:
-        InputError: the file is missing, damaged or of another version.
-    """
+    """Return tensors and facts of a file that `write_tensors` wrote; raises InputError as `read_network`."""
     if not regular(path).exists():
         raise InputError(f"{path}: no such checkpoint; train one with `endopilot train`")
     try:
@@ -91,11 +84,8 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
 
 
 def load_model(run: str | Path = WIRES) -> Predictor:
-    """Return the predictor of a run made by `endopilot train`, or the simulated wires, named "wires".
-
-    Raises:
-        InputError: the run is unfinished, or a file of it is damaged or of another version.
-    """
+    """Return the predictor of a run made by `endopilot train`, or the simulated wires, named "wires"; InputError for a
+    run that is unfinished, or of which a file is damaged or of another version."""
     if str(run) == WIRES:
         return SimulatedWires()
     record, folder = read_run(run), Path(run)

@@ -24,11 +24,7 @@ WIRES = "wires"
 
 
 def read_run(run: str | Path) -> dict[str, Any]:
-    """Return the manifest of a finished run; that of `WIRES` names no device and no patients.
-
-    Raises:
-        InputError: there is no such folder, or it is no finished run.
-    """
+    """Return the manifest of a finished run, or raise InputError; that of `WIRES` names no device and no patients."""
     if str(run) == WIRES:
         return {"config": {}, "device": None, "networks": {}, "patients": []}
     if not Path(run).is_dir():

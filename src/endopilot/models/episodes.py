@@ -64,11 +64,7 @@ class Episodes:
     @staticmethod
     def of_dataset(dataset: Dataset) -> Episodes:
         """Return the navigations of a dataset, with their true tips. Of patients who move the published mean is known,
-        with the phase of heart and breath.
-
-        Raises:
-            InputError: they are no longer than the states that a predictor is given.
-        """
+        with the phase of heart and breath. InputError where they are no longer than the states that are given."""
         samples = dataset.valid.shape[1]
         if samples <= WINDOW:
             seconds = (WINDOW + 1) * dataset.sample_period_s
@@ -174,33 +170,22 @@ class Predictor(Protocol):
 
 
 def needed(network: AnyNetwork | None, role: str) -> AnyNetwork:
-    """Return a network of a run, which must be there.
-
-    Raises:
-        InputError: it was not trained.
-    """
+    """Return a network of a run; InputError where it was not trained."""
     if network is None:
         raise InputError(f"the run has no {role} network; train it with --network both")
     return network
 
 
 def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
-    """Check that a dataset was made with the wire that a run was trained with; simulated wires take any devices.
-
-    Raises:
-        InputError: it was made with another wire.
-    """
+    """Raise InputError for a dataset made with another wire than a run was trained with; simulated wires take any."""
     if record["device"] is not None:
         with reading(run, "train anew"):
             check_same_wire(dataset, record["device"], run, "make a dataset with the run's wire")
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
-    """Return the names of the patients of a dataset that a run was trained on, by the SHA-256 of their anatomies.
-
-    Raises:
-        InputError: the dataset was made with another wire.
-    """
+    """Return the names of the patients of a dataset that a run was trained on, by the SHA-256 of their anatomies;
+    InputError for a dataset of another wire."""
     check_wire(run, record, dataset)
     trained = set(record["patients"])
     return frozenset(name for name, sha in dataset.patients.items() if sha in trained)

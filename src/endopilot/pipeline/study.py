@@ -342,15 +342,13 @@ def _report(run: _Run, anatomies: Sequence[Path]) -> None:
         command=run.command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=run.model,
         replay=replay,
         replay_anatomy=anatomy,
         navigation=run.navigation,
         stage_seconds=run.stages.seconds,
         manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
     )
-    for remark in write_report(output / REPORT_FILE, content):
-        print(remark, file=sys.stderr)
+    write_report(output / REPORT_FILE, content)
 
 
 def _scores(anatomies: Sequence[Path]) -> dict[str, dict[str, float]]:

@@ -1,23 +1,23 @@
-"""The figures of an evaluation and of a report: each function returns one; `titles` says what a reader calls each
-split."""
+"""The figures of an evaluation and of a report, and the tables of what they draw, which are written beside them as CSV;
+`titles` says what a reader calls each split."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Shaped
-from matplotlib.axes import Axes
+from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
-from endopilot.evaluation.results import SERIES_TITLES
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time
+from endopilot.evaluation.results import CONTROL_BASELINES, SERIES_TITLES, TIP_BASELINES, SplitResult
 from endopilot.imaging.overlay_picture import draw_slices
 from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
-from endopilot.report.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
 
 SERIES_STYLE: dict[str, dict] = {
@@ -34,8 +34,72 @@ SERIES_STYLE: dict[str, dict] = {
 }
 
 
+SAFETY_SERIES = ("true", "P3", "P4")
+
+
+def tip_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return the mean |error| of Δtip and γtip over the sequences, mm, for each split, series and time."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered(result.tips, [name for key, names in TIP_BASELINES.items() for name in (key, *names)]):
+            means = {
+                f"{coordinate}_mae_mm": mean_over_time(result.error(series, coordinate))
+                for coordinate in ("abscissa", "offset")
+            }
+            pieces.append(pd.DataFrame({"split": split, "series": series, "time_s": result.time_s, **means}))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def safety_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return quantiles over the sequences of γ/r ("radius") and γ/(r − r_w) ("clearance") against time."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered({"true": None, **result.tips}, SAFETY_SERIES):
+            tip = result.true if series == "true" else result.tips[series]
+            for ratio, wire_radius in (("radius", 0.0), ("clearance", result.wire_radius_mm)):
+                values = quantiles_over_time(safety_ratio(tip.offset, tip.radius, wire_radius))
+                keys = {"split": split, "series": series, "ratio": ratio, "time_s": result.time_s}
+                pieces.append(pd.DataFrame({**keys, **values}))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return the RMSE of each sequence's controls, in mm/s and deg/s, for each split and series."""
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered(result.controls, ("P2", *CONTROL_BASELINES)):
+            rmse = control_rmse(result.controls[series], result.true_control)
+            columns = {"translation_rmse_mm_s": rmse[:, 0], "rotation_rmse_deg_s": rmse[:, 1]}
+            anatomy = [result.anatomies[index] for index in result.anatomy]
+            keys = {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
+            pieces.append(pd.DataFrame(keys | columns))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def rows(table: pd.DataFrame, **equal: str) -> pd.DataFrame:
+    """Return the rows in which each named column has the given value."""
+    chosen = np.ones(len(table), dtype=bool)
+    for column, value in equal.items():
+        chosen &= np.asarray(table[column]) == value
+    return pd.DataFrame(table[chosen])
+
+
+def values(table: pd.DataFrame, column: str) -> np.ndarray:
+    """Return a column of numbers."""
+    return np.asarray(table[column], dtype=float)
+
+
+def distinct(table: pd.DataFrame, column: str) -> list[str]:
+    """Return the different values of a column in the order of their appearance."""
+    return [str(value) for value in dict.fromkeys(table[column])]
+
+
+def _ordered(available: Mapping[str, Any], order: Sequence[str]) -> list[str]:
+    return [name for name in dict.fromkeys(order) if name in available]
+
+
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw the mean |error| of Δtip and γtip against time, one row a split (`tables.tip_error_table`)."""
+    """Draw the mean |error| of Δtip and γtip against time, one row a split (`tip_error_table`)."""
     splits = distinct(table, "split")
     panels = (("abscissa_mae_mm", "Mean |error| of Δtip, mm"), ("offset_mae_mm", "Mean |error| of γtip, mm"))
     with matplotlib.rc_context(STYLE):
@@ -71,15 +135,8 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
                     ax.plot(time, values(line, "median"), **style)
                     ax.plot(time, values(line, "p95"), color=style["color"], lw=0.8, ls="-")
                 ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
-                ax.annotate(
-                    wall,
-                    (0.995, 1.0),
-                    xycoords=("axes fraction", "data"),
-                    ha="right",
-                    va="bottom",
-                    size=8.5,
-                    bbox=plate,
-                )
+                at = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+                ax.annotate(wall, (0.995, 1.0), size=8.5, bbox=plate, **at)
                 ax.set(xlabel="Time after the given states, s", ylabel=f"Safety ratio {label}", xlim=(0, None))
                 ax.set_ylim(0, float(np.clip(_upper(of_ratio, "p95"), 1.25, 1.5)))
                 ax.set_title(titles[split])
@@ -90,42 +147,30 @@ def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 
 def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
-    """Draw histograms of the control RMSE of each sequence (`tables.control_error_table`), a row a split, a series
-    above another, medians as ticks, with numbers; what lies beyond the second-widest series' 98 % quantile is in the
-    last bar."""
+    """Draw the control RMSE of the sequences (`control_error_table`), a row a split, a box a series: median,
+    quartiles, and whiskers from the 5 % to the 95 % quantile."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
     splits, series = distinct(table, "split"), distinct(table, "series")
+    names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
         for row, split in enumerate(splits):
-            part = rows(table, split=split)
-            most = max(len(rows(part, series=name)) for name in series)
-            bins = int(np.clip(3 * np.sqrt(most), 8, 25))
             for ax, (column, label) in zip(axes[row], panels, strict=True):
-                of_series = [values(rows(part, series=name), column) for name in series]
-                upper = sorted(float(np.nanquantile(v, 0.98)) for v in of_series if np.isfinite(v).any()) or [1.0]
-                edges = np.linspace(0.0, 1.05 * upper[max(len(upper) - 2, 0)] + 1e-9, bins + 1)
-                for level, (name, each) in enumerate(zip(series, of_series, strict=True)):
-                    _histogram(ax, each[np.isfinite(each)], edges, -float(level), _style(name)["color"])
-                names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
-                ax.set_yticks([0.3 - level for level in range(len(series))], names if ax is axes[row, 0] else [])
-                ax.set(xlabel=label, xlim=(0, edges[-1]), ylim=(0.75 - len(series), 1.05))
-                ax.tick_params(axis="y", length=0)
-                ax.grid(False, axis="y")
-                ax.set_title(titles[split])
+                of_series = [values(rows(table, split=split, series=name), column) for name in series]
+                drawn = ax.boxplot(
+                    [each[np.isfinite(each)] for each in of_series],
+                    orientation="horizontal",
+                    whis=(5, 95),
+                    showfliers=False,
+                    patch_artist=True,
+                    tick_labels=names if ax is axes[row, 0] else [""] * len(series),
+                    medianprops={"color": BLACK},
+                )
+                for box, name in zip(drawn["boxes"], series, strict=True):
+                    box.set_facecolor(_style(name)["color"])
+                ax.set(xlabel=label, xlim=(0, None), title=titles[split])
+                ax.invert_yaxis()
     return figure
-
-
-def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
-    if not len(of):
-        return
-    counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
-    top = int(counts.argmax())
-    ax.stairs(0.75 * counts / counts.max() + bottom, edges, baseline=bottom, fill=True, color=color)
-    left = top + 1 > len(counts) / 2  # of the bar, so that the words stay in the picture
-    place, side = (edges[top] if left else edges[top + 1], bottom + 0.73), "right" if left else "left"
-    ax.annotate(f" {counts.max()} of {len(of)} ", place, ha=side, va="top", fontsize=7.5)
-    ax.plot([min(float(np.median(of)), edges[-1])] * 2, [bottom, bottom - 0.12], color=BLACK)
 
 
 def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy) -> Figure:

@@ -42,6 +42,7 @@ def write_page(output: Path) -> Path:
     sections = [_section(output, task, content["patients"]) for task in tasks]
     page = render(
         "ladder.html.j2",
+        title=f"The ladder: {content['policy']}",
         of=len(list_tasks(content["ladder"])),
         policy=content["policy"],
         patients=content["patients"],

@@ -216,26 +216,26 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
     legend_above(axes)
 
 
+def _draw_under(axes: Axes, limit: float, highest: float, text: str, label: str, **line: Any) -> None:
+    """Draw a level of a figure over time, named at its right, and the axis from 0 to over all."""
+    axes.axhline(limit, color=GREY, linewidth=1, **line)
+    axes.annotate(text, (1.0, limit), xycoords=("axes fraction", "data"), fontsize=7.5, ha="right", va="bottom")
+    axes.set_ylim(0, 1.2 * max(limit, highest))
+    axes.set_ylabel(label)
+
+
 def _draw_safety(axes: Axes, found: PatientNavigation) -> None:
-    record = found.record
-    tip, radius = record.tip[:, 0], found.set_up.navigation.device.tip_radius_mm
+    tip, radius = found.record.tip[:, 0], found.set_up.navigation.device.tip_radius_mm
     ratio = safety_ratio(tip.offset, tip.radius, radius)
-    axes.plot(record.time_s, ratio, color=PURPLE)
-    axes.axhline(1.0, color=GREY, linewidth=1)
-    axes.annotate("wall", (1.0, 1.0), xycoords=("axes fraction", "data"), fontsize=7.5, ha="right", va="bottom")
+    axes.plot(found.record.time_s, ratio, color=PURPLE)
     axes.axhline(AdviserConfig().wall_ratio, color=GREY, linestyle="--", linewidth=1)
-    axes.set_ylim(0, 1.15 * max(1.0, float(ratio.max())))
-    axes.set_ylabel("safety ratio\nγ/(r − r_w)")
+    _draw_under(axes, 1.0, float(ratio.max()), "wall", "safety ratio\nγ/(r − r_w)")
 
 
 def _draw_force(axes: Axes, found: PatientNavigation) -> None:
     record, limit = found.record, found.set_up.navigation.force_limit_n
     axes.step(record.time_s, record.contact_force_max, where="pre", color=VERMILLION)
-    axes.axhline(limit, color=GREY, linestyle="--", linewidth=1)
-    axes.annotate(f"limit {limit:g} N", (1.0, limit), xycoords=("axes fraction", "data"), fontsize=7.5, ha="right",
-                  va="bottom")  # fmt: skip
-    axes.set_ylim(0, 1.25 * max(limit, record.peak_force_n))
-    axes.set_ylabel("largest wall\nforce, N")
+    _draw_under(axes, limit, record.peak_force_n, f"limit {limit:g} N", "largest wall\nforce, N", linestyle="--")
 
 
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
@@ -26,14 +25,10 @@ from endopilot.evaluation.results import (
 )
 from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
-from endopilot.models.config import WIRES
 from endopilot.plotting import png
-from endopilot.report import figures, report_text, tables
-from endopilot.report.scene import navigation_scene, scene_html, visible_devices
-from endopilot.report.still import render_still
+from endopilot.report import figures, report_text
+from endopilot.report.scene import navigation_scene, scene_html
 from endopilot.simulation.trajectory import Trajectory
-
-STILL_FILE = "scene.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +49,8 @@ class ReportContent:
 
     Attributes:
         origin: one sentence that says what the patients are: real, or synthetic and how made.
-        evaluation: folder made by `endopilot evaluate`; `run` of `endopilot train`; `navigation` of `endopilot
-            navigate`, beside or below the report.
+        evaluation: folder made by `endopilot evaluate`; `navigation` of `endopilot navigate`, beside or below the
+            report.
         replay: navigations with `shape`, in `replay_anatomy`, the first of which is shown in space.
         manifest: how everything was made (`files.manifest`).
     """
@@ -65,7 +60,6 @@ class ReportContent:
     command: str
     patients: tuple[PatientContent, ...] = ()
     evaluation: Path | None = None
-    run: Path | None = None
     replay: Trajectory | None = None
     replay_anatomy: Path | None = None
     navigation: Path | None = None
@@ -73,29 +67,25 @@ class ReportContent:
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write_report(output_html: Path, content: ReportContent) -> list[str]:
-    """Write the report as one HTML file, and the still picture `scene.png` beside it; return remarks, such as which
-    library a left-out picture needs. Raises InputError for a missing or damaged file, or a report that cannot be
+def write_report(output_html: Path, content: ReportContent) -> None:
+    """Write the report as one HTML file. Raises InputError for a missing or damaged file, or a report that cannot be
     written."""
     output_html = Path(output_html)
-    remarks: list[str] = []
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
     context = {
+        "title": content.title,
         "content": content,
         "metrics": metrics,
         "text": report_text,
         "patients": [_patient(patient) for patient in content.patients],
         "driven": _driven(content.navigation, output_html.parent),
-        "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
+        "scene": _scene(content),
         "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
-        "budget": _budget(content.run),
         "manifest": json_text(content.manifest) if content.manifest else "",
-        "remarks": remarks,
     }
     page = render("report.html.j2", **context)
     with writing(output_html) as partial:
         partial.write_text(page, encoding="utf-8")
-    return remarks
 
 
 def render(template: str, **content: Any) -> str:
@@ -138,7 +128,7 @@ def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
     }
 
 
-def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str, Any] | None:
+def _scene(content: ReportContent) -> dict[str, Any] | None:
     folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
     if folder is None:
         return None
@@ -147,23 +137,11 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     if replay is not None:
         seconds = replay.valid.shape[1] * replay.period_s
         caption = f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
-    problem = render_still(anatomy, _farthest(replay), still)
-    if problem is not None:
-        remarks.append(problem)
     return {
         "html": scene_html(figure),
         "plotly": Markup(get_plotlyjs()),
-        "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
         "caption": caption,
     }
-
-
-def _farthest(replay: Trajectory | None) -> list[np.ndarray]:
-    """Return the first world's wire where its tip is deepest in the vessel; nothing without a replay."""
-    if replay is None or replay.shape is None or not replay.valid[0].any():
-        return []
-    depth = np.where(replay.valid[0], replay.tip.abscissa[0, :, 0], -np.inf)
-    return visible_devices(replay, 0, int(np.argmax(depth)))
 
 
 def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
@@ -171,12 +149,6 @@ def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
     if path is None or not path.exists():
         return None
     return image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
-
-
-def _budget(run: Path | None) -> str:
-    if run is None or str(run) == WIRES:
-        return ""  # simulated wires are not trained
-    return report_text.training_budget(read_json(run / "training.json"))
 
 
 def image(png: bytes, description: str) -> Markup:
@@ -196,9 +168,9 @@ def report_evaluation(folder: Path) -> Path:
 
 def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str], folder: Path) -> None:
     drawn = {
-        "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
-        "safety_ratio": (tables.safety_table(results), figures.safety_figure),
-        "control_error": (tables.control_error_table(results), figures.control_error_figure),
+        "tip_error": (figures.tip_error_table(results), figures.tip_error_figure),
+        "safety_ratio": (figures.safety_table(results), figures.safety_figure),
+        "control_error": (figures.control_error_table(results), figures.control_error_figure),
     }
     for name, (table, draw) in drawn.items():
         with writing(folder / f"{name}.csv") as partial:
@@ -218,7 +190,6 @@ def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
         origin=f"The run {run}, on the dataset {dataset}.",
         command=" ".join(command),
         evaluation=folder,
-        run=Path(run),
         manifest=record,
     )
     page = folder / REPORT_FILE

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,31 +14,20 @@ from endopilot.types import Anatomy
 EVALUATION_FIGURES: Mapping[str, str] = {
     "tip_error": "Mean tip error against time, networks beside baselines",
     "safety_ratio": "Safety ratio against time: recorded, predicted and simulated",
-    "control_error": "Histograms of the control error of each navigation",
+    "control_error": "Control error of each navigation: medians and quartiles",
 }
 """Figures of an evaluation that the report shows, and what each is to someone who cannot see it."""
-
-NETWORK_TITLES: Mapping[str, str] = {"ff": "Forward network", "if": "Inverse network"}
 
 SPANS: tuple[str, ...] = tuple(span_name(span) for span in SPANS_S)
 COORDINATES: Mapping[str, str] = {"abscissa": "Δtip", "offset": "γtip"}
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One number of a table: what is shown, and where in metrics.json it stands ("/" between keys)."""
-
-    text: str
-    key: str = ""
-
-
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One line of a table; `kind` is "network", "baseline" or "paper"."""
 
     title: str
     kind: str
-    cells: tuple[Cell, ...]
+    cells: list[str]
 
 
 def headline_split(metrics: Mapping[str, Any]) -> str:
@@ -81,28 +69,20 @@ def tip_rows(metrics: Mapping[str, Any], split: str) -> list[Row]:
             if name in tip and name not in shown:
                 shown.add(name)
                 kind = "network" if name in TIP_BASELINES else "baseline"
-                rows.append(Row(SERIES_TITLES[name], kind, _tip_cells(tip, split, name)))
-    paper = tuple(
-        Cell(_mean_sd(metrics["paper"].get(span, {}).get(coordinate, {})), f"paper/{span}/{coordinate}/mae")
-        for coordinate in COORDINATES
-        for span in SPANS
-    )
-    blank = Cell("–")
-    rows.append(Row("Kim et al. 2023, on data of their own", "paper", (*paper[:3], blank, *paper[3:], blank, blank)))
-    return rows
+                cells = _tip_cells(tip[name])
+                rows.append(Row(SERIES_TITLES[name], kind, [*cells, f"{100 * tip[name]['diverged_share']:.0f} %"]))
+    spans = metrics["paper"].items()
+    paper = {coordinate: {span: of.get(coordinate, {}) for span, of in spans} for coordinate in COORDINATES}
+    return [*rows, Row("Kim et al. 2023, on data of their own", "paper", [*_tip_cells(paper), "–"])]
 
 
-def _tip_cells(tip: Mapping[str, Any], split: str, series: str) -> tuple[Cell, ...]:
-    cells: list[Cell] = []
-    for coordinate in COORDINATES:
-        where = f"splits/{split}/tip/{series}/{coordinate}"
-        for span in SPANS:
-            cells.append(Cell(_mean_sd(tip[series][coordinate].get(span, {})), f"{where}/{span}/mae"))
-        skills = {k: v for k, v in tip[series][coordinate]["all"]["skill"].items() if v is not None}
-        hardest = min(skills, key=lambda name: skills[name]) if skills else None
-        cells.append(Cell(_signed(skills[hardest]), f"{where}/all/skill/{hardest}") if hardest else Cell("–"))
-    cells.append(Cell(f"{100 * tip[series]['diverged_share']:.0f} %", f"splits/{split}/tip/{series}/diverged_share"))
-    return tuple(cells)
+def _tip_cells(series: Mapping[str, Any]) -> list[str]:
+    """Return a series' errors over the spans and its skill against the hardest baseline, of both coordinates."""
+    cells = []
+    for of in (series[coordinate] for coordinate in COORDINATES):
+        skills = [skill for skill in of.get("all", {}).get("skill", {}).values() if skill is not None]
+        cells += [*(_mean_sd(of.get(span, {})) for span in SPANS), _signed(min(skills, default=None))]
+    return cells
 
 
 def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
@@ -121,19 +101,6 @@ def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
     ]
 
 
-def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return the interval of the headline error over patients, or why there is none."""
-    record = metrics["splits"][split]
-    intervals = record["tip"]["P1"]["abscissa"]["all"]["intervals"]
-    if intervals is None:
-        return f"With {_count(len(record['anatomies']), 'patient')} the spread between patients is unknown."
-    low, high = intervals["mae"]
-    return (
-        f"Drawing the {len(record['anatomies'])} patients again (bootstrap), the mean error of Δtip in P1 lies between "
-        f"{low:.2f} and {high:.2f} mm in 95 % of draws; so few patients bound it only roughly."
-    )
-
-
 def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
     """Return the key facts of a vessel."""
     tree = anatomy.tree
@@ -148,36 +115,9 @@ def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
     ]
 
 
-def training_budget(record: Mapping[str, Any]) -> str:
-    """Return how long the networks were trained, as a sentence."""
-    parts = [
-        f"{NETWORK_TITLES[network].lower()} {_count(len(result['curve']), 'epoch')}, in all "
-        f"{sum(epoch['steps'] for epoch in result['curve']):,} steps in {result['seconds']:.0f} s"
-        for network, result in record.items()
-    ]
-    return f"Training: {'; '.join(parts)}. The paper trained for 20 epochs on 80,000 navigations."
-
-
 def score_columns(patients: list[dict[str, Any]]) -> list[str]:
     """Return the names of all scores that any patient has."""
     return list(dict.fromkeys(name for patient in patients for name in patient["scores"]))
-
-
-SCORE_TITLES: Mapping[str, str] = {
-    "dice": "Dice",
-    "cldice": "clDice",
-    "overlap": "centerline overlap",
-    "inside_accuracy_mm": "centerline error, mm",
-    "radius_mae_mm": "radius error, mm",
-    "ostium_error_mm": "ostium error, mm",
-    "false_length_mm": "false branches, mm",
-}
-"""Headings of the anatomy's scores; others are shown by their names."""
-
-
-def score_title(name: str) -> str:
-    """Return a score's heading."""
-    return SCORE_TITLES.get(name, name.replace("_", " "))
 
 
 def _mm(series: Mapping[str, Any], coordinate: str) -> str:
@@ -193,7 +133,3 @@ def _mean_sd(statistics: Mapping[str, Any]) -> str:
 
 def _signed(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}".replace("-", "−")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

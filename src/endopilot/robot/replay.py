@@ -331,14 +331,12 @@ def _simulated(
     tip = np.empty((*angles.shape, seen_s.shape[1], 3))
     abscissa, branch = np.empty(tip.shape[:-1]), np.empty(tip.shape[:-1])
     force = np.full((*angles.shape, control.shape[1]), np.nan)
-    before: list[Simulator] = []
     for some in np.array_split(np.argsort(samples), max(1, len(samples) // _TOGETHER)):
         last, worlds = int(samples[some].max()), angles[some].size
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
         initial[..., 1] += angles[some]
         deepest = float(place[..., 0].max())
-        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, sharing=before, reach_mm=deepest)
-        before = [made]
+        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, reach_mm=deepest)
         made.reset(inserted_length=initial[..., 0].reshape(-1, 1), rotation=initial[..., 1].reshape(-1, 1))
         driven = np.repeat(control[some, :last], angles.shape[1], axis=0)[:, :, None]
         moved = made.run(driven, period_s=_PERIOD_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -146,14 +147,46 @@ def make_simulation(
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Loading:
+    """Dead loads and springs on a rod; see `Loads` in the core. Entry i belongs to node i or element i."""
+
+    force_n: Float[np.ndarray, "n 3"]
+    moment_n_mm: Float[np.ndarray, "n 3"]
+    spring_n_mm: Float[np.ndarray, "n 3"]
+    anchor_mm: Float[np.ndarray, "n 3"]
+    hold_n_mm: Float[np.ndarray, "n"]
+    attitude: Float[np.ndarray, "n 4"]
+
+    @classmethod
+    def none(cls, nodes: int) -> Loading:
+        """Return no loads on a rod of `nodes` nodes."""
+        zero, attitude = np.zeros((nodes, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1))
+        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros(nodes), attitude)
+
+    def core(self) -> _core.Loads:
+        """Return the loads as the core wants them."""
+        return _core.make_loads(**{name.partition("_")[0]: value for name, value in vars(self).items()})
+
+
 def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.ndarray]:
     """Return what the core recorded of one device, the wire (0) or a catheter, and of all devices together."""
     return {name: values[:, :, device] if name in _OF_DEVICES else values for name, values in result.items()}
 
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
-    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
-    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": _base_orientation(insertion)}
+    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z of the wire's
+    axes at φ = 0: the third along it, the second against its bend. Where φ's zero is that of the world's axes, it is
+    the shortest turn that takes the third axis to the direction."""
+    direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
+    if isinstance(zero, np.ndarray):
+        axes = np.column_stack([np.cross(direction, zero), -zero, direction])
+        orientation = Rotation.from_matrix(axes).as_quat(canonical=True, scalar_first=True)
+    else:
+        quaternion = np.array([1 + direction[2], -direction[1], direction[0], 0.0])
+        norm = np.linalg.norm(quaternion)
+        orientation = quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
+    return {"origin": np.asarray(insertion.position, dtype=float), "orientation": orientation}
 
 
 def core_options(
@@ -200,16 +233,3 @@ def make_lumen(
         finer=finer,
         spheres=np.zeros((0, 8)) if spheres is None else np.ascontiguousarray(spheres, dtype=float),
     )
-
-
-def _base_orientation(insertion: Insertion) -> Float[np.ndarray, "4"]:
-    """Return the quaternion (w x y z) of a wire's axes at φ = 0: the third along it, the second against its bend. Where
-    φ's zero is that of the world's axes, it is the shortest turn that takes the third axis to the direction."""
-    direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
-    if isinstance(zero, np.ndarray):
-        axes = np.column_stack([np.cross(direction, zero), -zero, direction])
-        return Rotation.from_matrix(axes).as_quat(canonical=True, scalar_first=True)
-    axis = np.array([-direction[1], direction[0], 0.0])
-    quaternion = np.array([1 + direction[2], *axis])
-    norm = np.linalg.norm(quaternion)
-    return quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])

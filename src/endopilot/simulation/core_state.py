@@ -74,6 +74,6 @@ def _scale_friction(group: Group, devices: int, factors: Sequence[float]) -> Non
     for first, points in zip(CONTACTS, (position, middle), strict=True):
         rubs = numbers[..., first + LIMIT] > 0
         if rubs.any():
-            abscissa = group.project(points[rubs]).abscissa
+            abscissa = group.vessel.project(points[rubs]).abscissa
             numbers[rubs, first + LIMIT] *= factor_at(abscissa, group.anatomy.tree, factors)
     group.simulation.set_state(with_nodes(values, numbers, devices))

@@ -18,7 +18,7 @@ from endopilot.simulation import core_state as at
 from endopilot.simulation.config import FREE_BEHIND_MM
 from endopilot.simulation.controls import free_wire_load
 from endopilot.simulation.core import insertion_arguments
-from endopilot.simulation.groups import Group, kept
+from endopilot.simulation.groups import Group, prepared
 from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
@@ -84,7 +84,7 @@ class EngineSimulator(Simulator):
             if world not in self._rods:
                 base = insertion_arguments(group.anatomy.insertion)
                 axes = Rotation.from_quat(base["orientation"], scalar_first=True).as_matrix()
-                wall = kept((group.anatomy.identity, "points"), lambda: PointWall(group.anatomy.distance_map))
+                wall = prepared(group.anatomy, lambda: PointWall(group.anatomy.distance_map), "points").wall
                 self._rods[world] = KirchhoffRod(wall, base["origin"], axes, stack.wire, group.longest_mm)
             rod, (length, rotation) = self._rods[world], values[row, [at.LENGTH, at.ROTATION]].tolist()
             rod.reset(rotation, friction=float(values[row, at.FRICTION]))

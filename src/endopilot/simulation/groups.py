@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -104,8 +106,29 @@ def _inscribed_spheres(wall: Lumen, anatomy: Anatomy) -> Float[np.ndarray, "line
 
 
 GroupKey = tuple[str, tuple[Any, ...]]  # identity of an anatomy, and constants of its devices
-_KEPT = 4  # walls that are kept for the next simulator; each takes 4 bytes a point of the distance map
-_walls: dict[tuple[Any, ...], Any] = {}  # the last walls that were made, the latest last
+
+
+@dataclass(frozen=True, eq=False)
+class Vessel:
+    """A vessel as it is prepared for some devices: its wall, and what projects tips to its centerlines."""
+
+    wall: Any
+    project: TipProjector
+
+
+_prepared: WeakValueDictionary[tuple[Any, ...], Vessel] = WeakValueDictionary()
+_last: deque[Vessel] = deque(maxlen=4)  # are kept for the next simulator; each takes 4 bytes a point of its map
+
+
+def prepared(anatomy: Anatomy, make: Callable[[], Any], *made_of: Any) -> Vessel:
+    """Return a vessel with the wall that `made_of` says; one that a simulator has, or that was one of the last, is not
+    made again: that takes longer than a short run."""
+    key = anatomy.identity, *made_of
+    if (vessel := _prepared.get(key)) is None:
+        vessel = _prepared[key] = Vessel(make(), TipProjector(anatomy.tree, anatomy.insertion))
+    if vessel not in _last:
+        _last.append(vessel)
+    return vessel
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +136,7 @@ class Group:
     """The worlds with an equal anatomy and equal devices; `anatomy` and `stack` are those of the first.
 
     Attributes:
-        wall: what the lumen was made of, so that others of the same share it.
-        motion: of the vessel, None if it lies still; as the core has it, as are `lumen` and `simulation`.
+        motion: of the vessel, None if it lies still; as the core has it, as is `simulation`.
         index: the worlds' numbers, ascending.
         path_mm: length of the vessel's longest path; `longest_mm`: inserted length that the wire is laid out for.
     """
@@ -122,14 +144,12 @@ class Group:
     anatomy: Anatomy
     stack: Stack
     rod: RodLayout
-    lumen: Lumen
-    wall: tuple[Any, ...]
+    vessel: Vessel
     motion: CoreMotion | None
     simulation: Simulation
     index: Integer[np.ndarray, "members"]
     path_mm: float
     longest_mm: float
-    project: TipProjector
 
 
 def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
@@ -137,33 +157,15 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
     return anatomy.identity, stack.constants
 
 
-def _wall_key(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> tuple[Any, ...]:
-    of_config = config.wall_reach_mm, config.wall_along, config.wall_around, config.processor
-    return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters), *of_config
-
-
-def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-    """Return a wall of this key, as it was made where it is one of the last few: that takes longer than a short run."""
-    wall = _walls.pop(key, None)
-    _walls[key] = wall = make() if wall is None else wall
-    while len(_walls) > _KEPT:
-        _walls.pop(next(iter(_walls)), None)
-    return wall
-
-
 def make_groups(
     anatomies: Sequence[Anatomy],
     stacks: Sequence[Stack],
     motion: Motion | None,
     config: SimulatorConfig,
-    sharing: Sequence[Group],
     reach_mm: float,
 ) -> list[Group]:
     """Return the groups of worlds, with wires laid out (`reach_mm`, or to the vessel's far end if deeper) at the
-    ostium, about which vessels move by `motion`; `sharing`'s lumens are taken over. Raises InputError as `Simulator`.
-    """
-    lumens = {group.wall: group.lumen for group in sharing}
-    projectors = {group.anatomy.identity: group.project for group in sharing}
+    ostium, about which vessels move by `motion`. Raises InputError as `Simulator`."""
     members: dict[GroupKey, list[int]] = {}
     for world, pair in enumerate(zip(anatomies, stacks, strict=True)):
         members.setdefault(group_key(*pair), []).append(world)
@@ -171,11 +173,9 @@ def make_groups(
     for worlds in members.values():
         anatomy, stack = anatomies[worlds[0]], stacks[worlds[0]]
         stack.check(anatomy)
-        key = _wall_key(anatomy, stack, config)
-        if key not in lumens:
-            lumens[key] = kept(key, partial(make_wall, anatomy, stack, config))
-        if anatomy.identity not in projectors:
-            projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
+        of_config = config.wall_reach_mm, config.wall_along, config.wall_around, config.processor
+        made_of = stack.outer_radius_mm, bool(stack.catheters), *of_config
+        vessel = prepared(anatomy, partial(make_wall, anatomy, stack, config), *made_of)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = max(far_end_mm(anatomy), reach_mm)
         fewest = int(longest_mm / (LONGEST_ELEMENTS * config.element_mm))
@@ -185,7 +185,7 @@ def make_groups(
         moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
         simulation = make_simulation(
             rod,
-            lumens[key],
+            vessel.wall,
             anatomy.insertion,
             limits=stack.limits,
             push_limit_n=stack.push_limit_n,
@@ -195,6 +195,5 @@ def make_groups(
             motion=moving,
             transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
         )
-        where = (np.array(worlds), path_mm, longest_mm, projectors[anatomy.identity])
-        groups.append(Group(anatomy, stack, rod, lumens[key], key, moving, simulation, *where))
+        groups.append(Group(anatomy, stack, rod, vessel, moving, simulation, np.array(worlds), path_mm, longest_mm))
     return groups

@@ -154,7 +154,7 @@ class Readout:
 
     def _projected(self, points: Sequence[Float[np.ndarray, "_ *n 3"]]) -> TipProjection:
         """Return where points of each group's worlds, LPS mm, lie with respect to their centerlines."""
-        found = [group.project(each) for group, each in zip(self._groups, points, strict=True)]
+        found = [group.vessel.project(each) for group, each in zip(self._groups, points, strict=True)]
         names = TipProjection.__dataclass_fields__
         return TipProjection(**{name: self._merge([getattr(tip, name) for tip in found]) for name in names})
 

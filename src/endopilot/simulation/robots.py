@@ -27,35 +27,27 @@ class Recorder:
         self.simulator, self.period_s = simulator, period_s
         self._set_up, self._start, self._began_s = simulator.set_up, simulator.proximal, simulator.time
         self._commands: list[np.ndarray] = []
-        self._rows: list[np.ndarray] = []
+        self._steps: list[Step] = []
         self._shapes: list[np.ndarray] | None = [] if record_shape else None
-        self._step: Step | None = None
 
     def __len__(self) -> int:
         """Return the number of steps so far."""
-        return len(self._rows)
+        return len(self._steps)
 
     def step(self, control: ArrayLike) -> Step:
         """Drive every world for a period, as `Simulator.step` does."""
-        self._step = step = self.simulator.step(control, self.period_s)
+        self._steps.append(self.simulator.step(control, self.period_s))
         self._commands.append(np.array(control, dtype=float).reshape(self._start.shape))
-        # one row a world, for a step's many small arrays take much more memory
-        parts = (getattr(step, name).reshape(len(self._start), -1) for name in Step.__dataclass_fields__)
-        self._rows.append(np.concatenate([part.astype(float) for part in parts], axis=1))
         if self._shapes is not None:
             self._shapes.append(self.simulator.position)
-        return step
+        return self._steps[-1]
 
     def trajectory(self) -> Trajectory:
         """Return all steps so far; ValueError if there is none."""
-        if self._step is None:
+        if not self._steps:
             raise ValueError("nothing was driven yet")
-        rows, recorded, at = np.stack(self._rows, axis=1), {}, 0
-        for name in Step.__dataclass_fields__:
-            like = getattr(self._step, name)
-            count = like.size // len(like)
-            values = rows[:, :, at : at + count].reshape(*rows.shape[:2], *like.shape[1:])
-            recorded[name], at = values.astype(like.dtype), at + count
+        names = Step.__dataclass_fields__
+        recorded = {name: np.stack([getattr(step, name) for step in self._steps], axis=1) for name in names}
         if self._shapes is not None:
             recorded["shape"] = self.simulator._shown(np.stack(self._shapes, axis=1), recorded["inserted_length"])
         return self.simulator._made(

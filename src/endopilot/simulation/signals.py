@@ -101,14 +101,11 @@ def described(kind: _Class) -> _Class:
     """Complete the attributes of a class's docstring by the outputs that it has, as the core describes them."""
     text = (kind.__doc__ or "").rstrip()
     text += "" if "Attributes:" in text else "\n\n    Attributes:"
-    for name in (each.name for each in fields(kind) if each.name in _RECORDED):
+    for name in (each.name for each in fields(kind) if each.name in SIGNALS):
         unit = SIGNALS[name].unit
         text += f"\n        {name}: {SIGNALS[name].meaning}{', ' if unit else ''}{unit}."
     kind.__doc__ = text + "\n    "
     return kind
-
-
-_RECORDED = {name for name, of, *_ in _core.OUTPUTS if of in ("device", "sample")}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -64,7 +64,6 @@ class Simulator(Readout):
         actuation: Actuation = "velocity",
         motion: Motion | None = None,
         config: SimulatorConfig | None = None,
-        sharing: Sequence[Simulator] = (),
         reach_mm: float = 0.0,
     ) -> None:
         """Lay the devices out; every world starts with the wire's tip at the ostium.
@@ -79,7 +78,6 @@ class Simulator(Readout):
             motion: how every vessel moves with time; it lies still if not given. Positions and directions are those in
                 the vessel as CT shows it; `vessel_to_laboratory` says where that lies.
             config: settings of the rod core.
-            sharing: simulators that have prepared the same anatomies, whose lumens are then not prepared again.
             reach_mm: inserted length that the devices are laid out for, mm; at least 20 mm beyond the end of each
                 vessel's longest path.
 
@@ -109,9 +107,8 @@ class Simulator(Readout):
             raise InputError("actuation: 'force' with catheters; give 'velocity'")
         if actuation == "force" and any(one.length_mm > 0 for stack in stacks for one in stack.transmissions):
             raise InputError("actuation: 'force' with a length between drive and ostium; give 'velocity'")
-        groups = [group for each in sharing for group in each._groups]
         with gpu_errors(config.processor):
-            self._groups = make_groups(anatomies, stacks, motion, config, groups, reach_mm=reach_mm)
+            self._groups = make_groups(anatomies, stacks, motion, config, reach_mm)
         self._rows = np.argsort(np.concatenate([group.index for group in self._groups]))
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         own = np.array([[each.friction for each in stack.devices] for stack in stacks])

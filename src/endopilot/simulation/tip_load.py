@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot import _core
 from endopilot.devices.device import GRAM_FORCE_N, Wire, read_wire
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
+from endopilot.simulation.core import Loading, run_core
 from endopilot.simulation.rod import rod_at
 from endopilot.types import Insertion
 
@@ -48,15 +47,13 @@ def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
     """Push the distal 10 mm of a wire (or its name, or its YAML file), straight, against a smooth plate until it
     buckles; RuntimeError if the rod core did not converge."""
     wire = wire if isinstance(wire, Wire) else read_wire(wire)
-    size, nodes = (
-        HELD_MM / (_ELEMENTS - 0.5),
-        _ELEMENTS + 1,
-    )  # of the clamped element half is held: it fixes a direction
+    nodes = _ELEMENTS + 1
+    size = HELD_MM / (_ELEMENTS - 0.5)  # of the clamped element half is held: it fixes a direction
     at, drag = size * np.arange(nodes), np.full(nodes, _DRAG)
     rod = rod_at(wire, at, at + 0.5 * size, np.zeros((nodes, 3)), drag, drag)
-    dead, plate, anchor = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3))
-    dead[0, 1] = _IMPERFECTION * np.pi**2 * wire.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
-    plate[0, 0], anchor[0, 0] = _PLATE_N_MM, HELD_MM
+    loading = Loading.none(nodes)
+    loading.force_n[0, 1] = _IMPERFECTION * np.pi**2 * wire.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
+    loading.spring_n_mm[0, 0], loading.anchor_mm[0, 0] = _PLATE_N_MM, HELD_MM
     push = np.zeros((1, _SAMPLES, 2))
     push[..., 0] = _PUSH_SHARE * HELD_MM / _SAMPLES / _STATIC.time_step_s
     result = run_core(
@@ -67,14 +64,7 @@ def simulate_tip_load(wire: Wire | str | Path) -> TipLoadTest:
         initial=np.array([[HELD_MM, 0.0]]),
         control=push,
         friction=np.zeros(1),
-        loads=_core.make_loads(
-            force=dead,
-            moment=np.zeros((nodes, 3)),
-            spring=plate,
-            anchor=anchor,
-            hold=np.zeros(nodes),
-            attitude=np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1)),
-        ),
+        loads=loading.core(),
         record_shape=True,
         lanes=1,
         approach=False,

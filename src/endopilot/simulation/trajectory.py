@@ -58,15 +58,9 @@ class Trajectory(SolvedOutputs):
     Attributes:
         set_up: what the worlds were simulated with.
         period_s: time between samples, s.
-        start: Δ (mm) and φ (rad) of each device before the first period, as they truly were.
-        command: what the drives were asked for: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
         tip: Δtip, γtip, branch and lumen radius at each sample.
-        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
-            3 the wire went through the wall.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded; NaN beyond the
             nodes of a shorter wire.
-        vessel_to_laboratory: where a vessel that moves lies: affine maps of its points, as CT shows them, to the
-            laboratory, LPS mm; None where it lies still.
         columns: further signals by name, such as those of a robot, a policy or a plan; `SIGNALS` describes them.
         about: what else is to be known, as plain JSON values.
     """
@@ -161,7 +155,9 @@ class Trajectory(SolvedOutputs):
             elif path.suffix == ".csv":
                 trajectory_table(self).to_csv(partial, index=False)
             else:
-                arrays = _arrays(self)
+                # what follows from others is left out, and further signals are marked as such
+                found = {name: each for name, each in trajectory_signals(self).items() if name != "control"}
+                arrays = {f"column.{name}" if name in self.columns else name: each for name, each in found.items()}
                 with partial.open("wb") as stream:
                     np.savez_compressed(stream, about=np.array(_about(self, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -263,13 +259,6 @@ def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | 
     own = {name: values for name, values in arrays.items() if name in names}
     columns = {name.removeprefix("column."): values for name, values in arrays.items() if name.startswith("column.")}
     return Trajectory(set_up=set_up, period_s=about["period_s"], tip=tip, columns=columns, about=about["about"], **own)
-
-
-def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the arrays of a file: what follows from others is left out, and further signals are marked as such."""
-    found = trajectory_signals(trajectory)
-    del found["control"]
-    return {f"column.{name}" if name in trajectory.columns else name: each for name, each in found.items()}
 
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:

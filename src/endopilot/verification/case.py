@@ -12,7 +12,7 @@ from jaxtyping import Float
 from endopilot import _core
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import of_device, run_core
+from endopilot.simulation.core import Loading, of_device, run_core
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import Insertion
@@ -120,28 +120,6 @@ def uniform_rod(nodes: int, size_mm: float, **section: float) -> RodLayout:
     """Return a straight rod whose section, by the fields of `RodLayout`, is the same throughout."""
     throughout = {name: np.full(nodes, value) for name, value in section.items()}
     return RodLayout(abscissa_mm=size_mm * np.arange(nodes), rest_curvature=np.zeros((nodes, 3)), **throughout)
-
-
-@dataclass(frozen=True, eq=False)
-class Loading:
-    """Dead loads and springs on a rod; see `Loads` in the core. Entry i belongs to node i or element i."""
-
-    force_n: Float[np.ndarray, "n 3"]
-    moment_n_mm: Float[np.ndarray, "n 3"]
-    spring_n_mm: Float[np.ndarray, "n 3"]
-    anchor_mm: Float[np.ndarray, "n 3"]
-    hold_n_mm: Float[np.ndarray, "n"]
-    attitude: Float[np.ndarray, "n 4"]
-
-    @classmethod
-    def none(cls, nodes: int) -> Loading:
-        """Return no loads on a rod of `nodes` nodes."""
-        zero, attitude = np.zeros((nodes, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1))
-        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros(nodes), attitude)
-
-    def core(self) -> _core.Loads:
-        """Return the loads as the core wants them."""
-        return _core.make_loads(**{name.partition("_")[0]: value for name, value in vars(self).items()})
 
 
 def equilibrium(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, find_objects, minimum_filter
 
-from endopilot.errors import InputError, place_text
+from endopilot.errors import InputError
 from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 from endopilot.vessels import repair, repair_surface
@@ -34,7 +34,6 @@ GRID_MM = 0.5  # grid spacing at which the arteries are compared, mm
 
 _NAMES = {"rca": "right coronary artery", "lca": "left coronary artery"}
 _NAMED, _WORTH_NAMING = 4, 0.02
-_AS_WELL = 0.2  # other axes explain a lumen nearly as well as the other artery does
 _SIDES = ("left and right", "front and back", "up and down")
 _EVERY = 4  # of the skeleton's points, some 0.6 mm apart, are enough to find vessels in the aorta
 
@@ -49,7 +48,6 @@ class CoronaryInlet:
     runner_up: OstiumCandidate | None
     crux: Crux | None = None
     other: Float[np.ndarray, "3"] | None = None
-    notes: tuple[str, ...] = ()
 
     def record(self) -> dict[str, object]:
         """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
@@ -93,68 +91,50 @@ def coronary_inlet(
     rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
     ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]
     best, other = ranking.candidates[0], counterpart.candidates[0]
-    if best.probability < CERTAIN or ranking.touching.probability > 0.5:
+    if not _is_certain(ranking):
         raise InputError(f"{label}: {_doubt(ranking, counterpart, side, coordinates)}")
     crux, paired = None, other.probability >= PRESENT and other.piece != best.piece
     if paired:
         right, left = (best, other) if side == "rca" else (other, best)
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
     runner_up = ranking.candidates[1] if len(ranking.candidates) > 1 else None
-    mirrored = not paired and counterpart.axes[1] > _AS_WELL * counterpart.absent
-    rival = f"{_exchanged(counterpart.axes[0])}, this would be a {_NAMES['lca' if side == 'rca' else 'rca']}"
-    notes = (f"{rival}: check the axes of the file",) if mirrored else ()
-    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None, notes)
+    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None)
+
+
+def _is_certain(ranking: OstiumRanking) -> bool:
+    return ranking.candidates[0].probability >= CERTAIN and ranking.touching.probability <= 0.5
 
 
 def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coordinates: str | None) -> str:
-    """Say why an artery's ostium is in doubt, and what mends it: only what the program would then accept."""
-    best, absent, (axes, turned) = ranking.candidates[0], ranking.absent, ranking.axes
-    first, name = _option(best.position), _NAMES[side]
+    """Say what a lumen may hold instead of an artery with a sure ostium, the likeliest first, and what mends each."""
     other: Side = "lca" if side == "rca" else "rca"
-    if turned >= max(best.probability, absent, _WORTH_NAMING):
-        return f"its axes seem to be other ones: {_in_other_axes(axes, coordinates)}"
-    if ranking.touching.probability > max(0.5, absent):
-        return (
-            f"one lumen seems to hold both coronary arteries, or arteries and veins, which touch; give each a label of "
-            f"its own, or say where the {name} begins, perhaps --ostium-mm {_option(ranking.touching.position)}"
-        )
-    if absent > best.probability and turned > _AS_WELL * absent:
-        return (
-            f"holds no {name} in the axes that it was read in; {_in_other_axes(axes, coordinates)}; "
-            f"if the axes are right, say where it begins, perhaps --ostium-mm {first}"
-        )
-    if absent > best.probability and counterpart.candidates[0].probability >= CERTAIN:
-        return (
-            f"holds no {name}: what is in it looks like the {_NAMES[other].split()[0]} one; "
-            f"take --vessel {other}, or say where it begins, perhaps --ostium-mm {first}"
-        )
-    named = [candidate for candidate in ranking.candidates[:_NAMED] if candidate.probability > _WORTH_NAMING]
-    places = ", ".join(
-        f"{place_text(each.position)} {each.probability:.0%}" for each in named or ranking.candidates[:1]
-    )
-    return (
-        f"it is not certain where the {name} begins: {places} (LPS, probability); look, and give the right "
-        f"one, such as --ostium-mm {first}"
-        + (f"; or, {_in_other_axes(axes, coordinates)}" if turned > _AS_WELL * best.probability else "")
-    )
-
-
-def _exchanged(axes: str) -> str:
-    return f"with {', '.join(w for w, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)} exchanged"
+    held = _is_certain(counterpart)
+    both = "one lumen seems to hold both coronary arteries, or arteries and veins, which touch: give each its own label"
+    rows = [
+        *((each.probability, f"it begins there: --ostium-mm {_option(each)}") for each in ranking.candidates[:_NAMED]),
+        (ranking.touching.probability, f"{both}, or --ostium-mm {_option(ranking.touching)}"),
+        (ranking.axes[1], _in_other_axes(ranking.axes[0], coordinates)),
+        (ranking.absent, f"it is the {_NAMES[other]}: take --vessel {other}" if held else "it is not in the file"),
+    ]
+    likely = sorted((row for row in rows if row[0] > _WORTH_NAMING or row is rows[0]), key=lambda row: -row[0])
+    answers = "; or ".join(f"{share:.0%} {text}" for share, text in likely)
+    return f"it is not certain where the {_NAMES[side]} begins (LPS, probability): {answers}"
 
 
 def _in_other_axes(axes: str, coordinates: str | None) -> str:
     """Say in which other axes a file holds what it should, and what to give."""
-    reads = f"{_exchanged(axes)}, what is in it looks as in patients"
+    exchanged = ", ".join(side for side, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)
     if coordinates is None:
-        return f"{reads}: mend the orientation that the file states, or export it again"
-    if axes != "ras":
-        return f"{reads}: export it again in LPS axes"
-    return f"{reads}: {'leave --coordinates ras out' if coordinates == 'ras' else 'give --coordinates ras'}"
+        mend = "mend the orientation that the file states, or export it again"
+    elif axes != "ras":
+        mend = "export it again in LPS axes"
+    else:
+        mend = "leave --coordinates ras out" if coordinates == "ras" else "give --coordinates ras"
+    return f"with {exchanged} exchanged, what is in it looks as in patients: {mend}"
 
 
-def _option(position: Float[np.ndarray, "3"]) -> str:
-    return " ".join(f"{value:.1f}" for value in position)
+def _option(candidate: OstiumCandidate) -> str:
+    return " ".join(f"{value:.1f}" for value in candidate.position)
 
 
 def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:

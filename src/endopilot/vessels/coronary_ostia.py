@@ -61,14 +61,12 @@ NEITHER = -14.0  # score below which two arteries are rather something else. Bot
 ALONE = -9.0  # the same for a single artery, which scores 0 to −5
 TOUCHING = -8.0  # what it costs to take one lumen for both arteries, which touch or run together with their veins
 
-OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
-    "ras": (np.array([-1.0, -1.0, 1.0]), -2.5),
-    "rps": (np.array([-1.0, 1.0, 1.0]), -5.0),
-    "las": (np.array([1.0, -1.0, 1.0]), -5.0),
-    "lpi": (np.array([1.0, 1.0, -1.0]), -5.0),
-    "rai": (np.array([-1.0, -1.0, -1.0]), -5.0),
-    "rpi": (np.array([-1.0, 1.0, -1.0]), -5.0),
-    "lai": (np.array([1.0, -1.0, -1.0]), -5.0),
+OTHER_AXES = {
+    axes: (
+        np.array([1.0 if one == of else -1.0 for one, of in zip(axes, "lps", strict=True)]),
+        -2.5 if axes == "ras" else -5.0,
+    )
+    for axes in ("ras", "rps", "las", "lpi", "rai", "rpi", "lai")
 }
 """Axes that a file may be in instead of LPS: the signs that turn it over, and the logarithm of how likely that is."""
 

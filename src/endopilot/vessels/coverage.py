@@ -13,9 +13,8 @@ from endopilot.errors import place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
 from endopilot.vessels.medial_lines import MedialLines
-from endopilot.vessels.repair import NOTED_MM
+from endopilot.vessels.remarks import longest_first
 from endopilot.vessels.surface import MAXIMUM_GRID_POINTS, Surface, blur_voxels, smooth_level
-from endopilot.vessels.topology import MOST_LISTED
 
 _REACH_VOXELS = 1.5  # the tree reaches so many voxels beyond its radius: the mask's middle is not smooth
 
@@ -47,15 +46,22 @@ def voxelised(surface: Surface, step_mm: float) -> Volume:
     """Return all voxels (edge `step_mm`, or larger) that a closed wall holds or touches: no thin neck is lost."""
     extent = np.ptp(surface.vertices, axis=0)
     most = max(float(np.prod(extent + 4 * step_mm)) / _MOST_VOXELS, abs(surface.volume) / _MOST_INSIDE)
-    step = max(step_mm, most ** (1 / 3))
-    origin = surface.vertices.min(axis=0) - 2 * step
-    size = np.ceil(extent / step).astype(int) + 5
-    voxels = surface.inside((int(size[2]), int(size[1]), int(size[0])), origin, step)
-    fine = surface.refined(0.7 * step)
+    shell = touched(surface, max(step_mm, most ** (1 / 3)), 2)
+    nz, ny, nx = shell.voxels.shape
+    inside = surface.inside((nz, ny, nx), shell.origin_mm, float(shell.spacing_mm[0]))
+    return replace(shell, voxels=inside | shell.voxels)
+
+
+def touched(surface: Surface, step_mm: float, margin: int) -> Volume:
+    """Return the voxels of edge `step_mm` that a surface touches, in its box with a margin in voxels."""
+    origin = surface.vertices.min(axis=0) - margin * step_mm
+    size = np.ceil(np.ptp(surface.vertices, axis=0) / step_mm).astype(int) + 2 * margin + 1
+    voxels = np.zeros(tuple(size[::-1]), dtype=bool)
+    fine = surface.refined(0.7 * step_mm)
     samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
-    index = np.rint((samples - origin) / step).astype(int)
+    index = np.rint((samples - origin) / step_mm).astype(int)
     voxels[index[:, 2], index[:, 1], index[:, 0]] = True
-    return Volume(voxels, np.full(3, step), origin, np.eye(3))
+    return Volume(voxels, np.full(3, step_mm), origin, np.eye(3))
 
 
 def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, Float[np.ndarray, "n 3"], list[str]]:
@@ -110,25 +116,13 @@ def stretches(
 
 
 def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
-    """Return remarks on parts that a tree does not reach, one for all crumbs; up to `reach_mm` they lie behind it."""
-    left = sorted(left, key=lambda stretch: -stretch.length_mm)
-    long = [s for s in left if s.length_mm >= NOTED_MM]
-    remarks = []
-    for stretch in long[:MOST_LISTED]:
+    """Return remarks on parts that a tree does not reach; up to `reach_mm` from the ostium they lie behind it."""
+    found = []
+    for stretch in left:
         behind = " behind the ostium" if np.linalg.norm(stretch.place - ostium) < reach_mm else ""
-        remarks.append(
-            f"{stretch.length_mm:.0f} mm of the lumen{behind} from {place_text(stretch.place)} are not in the tree"
-        )
-    if len(long) > MOST_LISTED:
-        places = ", ".join(f"{s.length_mm:.0f} mm from {place_text(s.place)}" for s in long[MOST_LISTED:])
-        remarks.append(f"neither are {places}")
-    crumbs = sum(s.length_mm for s in left) - sum(s.length_mm for s in long)
-    if crumbs >= NOTED_MM:
-        count = len(left) - len(long)
-        remarks.append(
-            f"{count} bumps and twigs of less than {NOTED_MM:g} mm, {crumbs:.0f} mm together, are no branches"
-        )
-    return remarks
+        text = f"{stretch.length_mm:.0f} mm of the lumen{behind} from {place_text(stretch.place)} are not in the tree"
+        found.append((stretch.length_mm, text))
+    return longest_first(found, "{} bumps and twigs, {:.0f} mm together, are no branches")
 
 
 def record(lines: MedialLines, wide: Float[np.ndarray, "m 3"], left: list[Stretch]) -> dict[str, float]:
@@ -172,16 +166,10 @@ def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "
 
 
 def _widened_text(wide: list[Stretch], radius_mm: float) -> list[str]:
-    remarks = []
-    long = [s for s in wide if s.length_mm + s.beyond_mm >= NOTED_MM]
-    size = f"a radius of {radius_mm:.1f} mm or more"
-    for stretch in long[:MOST_LISTED]:
-        place = place_text(stretch.place)
+    found = []
+    for stretch in wide:
         beyond = f", {stretch.beyond_mm:.0f} mm of vessel lie beyond it" if stretch.beyond_mm >= 1.0 else ""
-        kind = "neck" if beyond else "thin branch"
-        remarks.append(f"a {kind} of {stretch.length_mm:.1f} mm from {place} was widened to {size}{beyond}")
-    rest = [s for s in wide if not any(s is other for other in long[:MOST_LISTED])]
-    if rest:
-        total = sum(s.length_mm for s in rest)
-        remarks.append(f"{len(rest)} more thin places of together {total:.0f} mm were widened likewise")
-    return remarks
+        kind = f"{'neck' if beyond else 'thin branch'} of {stretch.length_mm:.1f} mm from {place_text(stretch.place)}"
+        text = f"a {kind} was widened to a radius of {radius_mm:.1f} mm or more{beyond}"
+        found.append((stretch.length_mm + stretch.beyond_mm, text))
+    return longest_first(found, "{} more thin places, {:.0f} mm together, were widened likewise")

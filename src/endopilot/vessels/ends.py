@@ -11,7 +11,6 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from endopilot.errors import place_text
 from endopilot.lines import length_along
 from endopilot.vessels.graph import RootedGraph, VesselGraph, lumen_graph
 from endopilot.vessels.surface import Surface
@@ -30,8 +29,6 @@ _NECK, _DOME = 1.3, 4.0  # an end this much wider than its neck, at most the sec
 _LINE_ENDS, _NO_LINE = 0.5, 0.1
 """Lines run from the inlet, as VMTK writes them: one that ends at a place says this share of what one that begins there
 says for it; a place where no line begins or ends is as little likely as the second."""
-
-_RIVAL = 0.55  # ends that look this much like the inlet as the best one are named
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,23 +149,11 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True, eq=False)
 class InletEnd:
-    """An end that a device may enter at: tip, middle, radius, mm, and score, the radius less what speaks against it."""
+    """An end that a device may enter at: tip, its middle, and score, the radius, mm, less what speaks against it."""
 
     node: int
     position: Float[np.ndarray, "3"]
-    radius: float
     score: float
-
-    def rivals(self, others: Sequence[InletEnd]) -> list[str]:
-        """Say which other ends look so much like the inlet that the device may as well enter there."""
-        near = [end for end in others if end is not self and end.score > _RIVAL * self.score]
-        if not near:
-            return []
-        places = ", ".join(f"{place_text(end.position)} ({2 * end.radius:.1f} mm wide)" for end in near[:4])
-        return [
-            f"the end at {places} could be an inlet too; taken is {place_text(self.position)} "
-            f"({2 * self.radius:.1f} mm wide): --ostium-mm chooses another"
-        ]
 
 
 def likely_inlets(
@@ -211,7 +196,7 @@ def likely_inlets(
         score *= 0.6 - 0.4 * (rank_correlation(away, widths) if np.ptp(widths) > 0 else 0.0)
         if lines:
             score *= max(float(np.where(near[:, 0], 1.0, _LINE_ENDS * near[:, 1]).mean()), _NO_LINE)
-        found.append(InletEnd(int(path[-1]), middle_of_end, radius, float(score)))
+        found.append(InletEnd(int(path[-1]), middle_of_end, float(score)))
     return sorted(found, key=lambda end: -end.score)
 
 

@@ -31,18 +31,13 @@ LIKENESS_SD = 0.25  # spread of the logarithm of likeness to an inlet: half of i
 _BRANCH_MM = 4.0
 
 
-def piece_on_side(
-    sizes: Float[np.ndarray, "n"], centres: Float[np.ndarray, "n 3"], vessel: Vessel
-) -> tuple[int, list[int]]:
-    """Return which of several lumens (of sizes in any unit of volume) is the vessel, and which others are nearly as
-    large. Among such the side decides: the right coronary artery has the smaller x in LPS; else the largest is it."""
-    large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
+def piece_on_side(sizes: Float[np.ndarray, "n"], centres: Float[np.ndarray, "n 3"], vessel: Vessel) -> int:
+    """Return which of several lumens (of sizes in any unit of volume) is the vessel: the largest, or of those nearly as
+    large the one on an artery's side, the right coronary artery having the smaller x in LPS."""
     if vessel == "generic":
-        chosen = int(sizes.argmax())
-    else:
-        across = centres[large, 0] if vessel == "rca" else -centres[large, 0]
-        chosen = int(large[across.argmin()])
-    return chosen, [int(piece) for piece in large if piece != chosen]
+        return int(sizes.argmax())
+    large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
+    return int(large[(centres[large, 0] * (1 if vessel == "rca" else -1)).argmin()])
 
 
 def component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
@@ -216,7 +211,7 @@ def _ostium_beyond(
         [np.ptp(graph.length[piece == i]) if (piece == i).any() else 0.0 for i in range(1, count + 1)], dtype=float
     )
     centres = np.array(center_of_mass(labels > 0, labels, range(1, count + 1)))[:, ::-1]
-    chosen, _ = piece_on_side(reach, origin + spacing * centres, vessel)
+    chosen = piece_on_side(reach, origin + spacing * centres, vessel)
     tip = int(np.where(piece == chosen + 1, graph.length, -1.0).argmax())
     way = graph.back(tip, piece != chosen + 1)
     # The direction is left open: the refined centerline gives it better than this grid.

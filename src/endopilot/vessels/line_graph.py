@@ -10,14 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError, place_text
 from endopilot.lines import length_along, places_on
 from endopilot.types import Insertion
 from endopilot.vessels.ends import likely_inlets
-from endopilot.vessels.graph import Line, RootedGraph, VesselGraph
+from endopilot.vessels.graph import Line, RootedGraph, VesselGraph, pieces, split
+from endopilot.vessels.remarks import longest_first
 from endopilot.vessels.sources import Polylines
 
 STEP_MM = 0.5  # distance between the points of the tree, mm
@@ -29,9 +30,6 @@ _OWN_MM = 2.0  # a line comes back to a place where coinciding points lie farthe
 _SHORTEST_MM = 2.0
 
 _RIVAL = 0.4  # lines that are not connected to a piece this share as long are another artery's
-_NEIGHBOURS = 6  # points of a line are compared with this many nearest ones
-_DISORDER = 2.0  # a line this many times as long as the shortest tree through its points is in no order
-_JUMP_STEPS, _JUMP_RADII = 8.0, 5.0  # a step of more usual ones, and radii, leads to another vessel
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,32 +84,20 @@ class LineGraph(VesselGraph):
 
 @dataclass(frozen=True, eq=False)
 class FoundLines:
-    """The lines of one tree in centerlines, and what became of the others.
-
-    Attributes:
-        rule: by which the root was chosen.
-        rivals: a note on other ends that may be the inlet.
-        whole: all lines as given.
-        piece: connected piece of each point of `whole`, -1 in the parent vessel that the lines start in.
-        own: the piece that the tree was made from.
-        bridged_mm: length of gaps that were bridged, mm.
-    """
+    """The lines of one tree in centerlines, the rule that chose its root, notes on what was done and left out, and the
+    balance of `_left_out`."""
 
     lines: list[Line]
     rule: str
     notes: list[str]
-    rivals: list[str]
-    whole: LineGraph
-    piece: Int[np.ndarray, "n"]
-    own: int
-    bridged_mm: float
+    coverage: dict[str, float]
 
 
 def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: str = "generic") -> FoundLines:
     """Return the lines of one tree in centerlines with radii, LPS mm, cut where they leave a parent vessel that they
-    start in (VMTK's: the aorta). Raises InputError where a line's points are in no order, no line is near the given
-    ostium, or a coronary artery is asked for and the lines are those of two."""
-    source, notes = in_order(source, label)
+    start in (VMTK's: the aorta). Raises InputError where no line is near the given ostium, or a coronary artery is
+    asked for and the lines are those of two."""
+    source, notes = _without_repeats(source, label)
     whole = line_graph(source)
     keep, cut_at = _outside_parent_vessel(whole)
     graph = _meeting(whole.outside(keep))
@@ -121,7 +107,7 @@ def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: 
         f"a gap of {gap:.1f} mm between lines at {place_text(graph.points[end])} is bridged"
         for gap, end in zip(bridged, gaps[:, 0], strict=True)
     ]
-    graph, rivals = graph.met(gaps), list[str]()
+    graph = graph.met(gaps)
     goal = cut_at if given is None else given.position
     if goal is not None:
         gap = np.linalg.norm(graph.points - goal, axis=1)
@@ -134,13 +120,12 @@ def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: 
     else:
         tree = _rooted(graph, _widest_end(graph, vessel, label))
         ends = [line[[0, -1]] for line in source.points]
-        first, *others = likely_inlets(tree, tree.traced(_SHORTEST_MM, together=True), lines=ends)
-        root, rule, rivals = first.node, "widest end", first.rivals(others)
-    paths = _rooted(graph, root).traced(_SHORTEST_MM, together=True)
+        root, rule = likely_inlets(tree, tree.traced(_SHORTEST_MM, together=True), lines=ends)[0].node, "widest end"
+    lines = _lines(graph.points, graph.radius, _rooted(graph, root).traced(_SHORTEST_MM, together=True))
     piece = np.full(len(keep), -1)
     piece[keep] = graph.pieces
-    lines = _lines(graph.points, graph.radius, paths)
-    return FoundLines(lines, rule, notes, rivals, whole, piece, int(graph.pieces[root]), float(bridged.sum()))
+    lost, balance = _left_out(whole, lines, piece, int(graph.pieces[root]))
+    return FoundLines(lines, rule, notes + lost, {**balance, "bridged_mm": round(float(bridged.sum()), 1)})
 
 
 def _rooted(graph: LineGraph, root: int) -> RootedGraph:
@@ -272,10 +257,8 @@ def _resampled(
     return line, np.interp(wanted, length[distinct], radius[distinct])
 
 
-def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
-    """Return lines that follow their vessels, and what was done: repeated points dropped, points sorted where only one
-    order is the shortest, gaps closed by straight pieces, jumps to another vessel cut. Raises InputError for points in
-    no order."""
+def _without_repeats(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
+    """Return lines that repeat no point in succession, and notes on those left out, or too coarse for their radii."""
     points, radii, notes = [], [], []
     for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
         name = source.name(number)
@@ -284,67 +267,43 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
         if len(line) < 2:
             notes.append(f"{name}: all its points coincide at {place_text(line[0])}: left out")
             continue
-        order = _order(line, f"{label}: {name}")
-        if order is not None:
-            before, after = length_along(line)[-1], length_along(line[order])[-1]
-            line, size = line[order], size[order]
-            notes.append(
-                f"{name}: its points were in another order than along the vessel, and are sorted "
-                f"({before:.0f} mm became {after:.0f} mm)"
-            )
         step = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        reach = size[1:] + size[:-1]
-        apart = step > reach
-        jump = apart & (step > _JUMP_RADII * reach) & (step > _JUMP_STEPS * np.median(step))
-        notes += [f"{name} jumps by {step[i]:.1f} mm at {place_text(line[i])}: cut there" for i in np.flatnonzero(jump)]
-        coarse = np.flatnonzero(apart & ~jump)
-        if len(coarse):
-            longest = int(coarse[step[coarse].argmax()])
+        apart = step > size[1:] + size[:-1]
+        if apart.any():
             notes.append(
-                f"{name}: the spheres of {len(coarse)} neighbouring points do not touch (the longest step, "
-                f"{step[longest]:.1f} mm, is at {place_text(line[longest])}): joined by straight pieces of "
-                f"{step[coarse].sum():.1f} mm in all"
+                f"{name}: the spheres of {apart.sum()} neighbouring points do not touch (the longest step, "
+                f"{step.max():.1f} mm, is at {place_text(line[step.argmax()])}): joined by straight pieces"
             )
-        for part in np.split(np.arange(len(line)), np.flatnonzero(jump) + 1):
-            if len(part) > 1:
-                points.append(line[part])
-                radii.append(size[part])
-            else:
-                notes.append(f"{name}: the single point at {place_text(line[part[0]])} is left out")
+        points.append(line)
+        radii.append(size)
     if not points:
         raise InputError(f"{label}: holds no line of at least two distinct points; export the centerline again")
     return Polylines(tuple(points), tuple(radii)), notes
 
 
-def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] | None:
-    """Return points' order along the vessel if it is another: the shortest tree through them, if it has no fork."""
-    count = len(line)
-    if count < 4:
-        return None
-    near = np.asarray(KDTree(line).query(line, k=min(_NEIGHBOURS, count - 1) + 1)[1])
-    rows = np.concatenate([np.repeat(np.arange(count), near.shape[1]), np.arange(count - 1)])
-    columns = np.concatenate([near.ravel(), np.arange(1, count)])
-    pairs = np.unique(np.sort(np.stack([rows, columns], axis=1)[rows != columns], axis=1), axis=0)
-    gap = np.linalg.norm(line[pairs[:, 0]] - line[pairs[:, 1]], axis=1) + 1e-9
-    shortest = minimum_spanning_tree(csr_matrix((gap, (pairs[:, 0], pairs[:, 1])), shape=(count, count))).tocoo()
-    given, least = length_along(line)[-1], float(shortest.data.sum())
-    if given < least + 1.5 * float(np.median(shortest.data)):
-        return None
-    degree = np.bincount(np.concatenate([shortest.row, shortest.col]), minlength=count)
-    turns = _turns(line)
-    if degree.max() <= 2:
-        order = breadth_first_order(shortest.tocsr(), int(np.flatnonzero(degree == 1)[0]), directed=False)[0]
-        order = order if order[0] < order[-1] else order[::-1]
-        if turns > _turns(line[order]):
-            return order
-    elif given > _DISORDER * least and turns > max(3, count // 4):
-        raise InputError(
-            f"{label}: its points are not in order along a vessel (they turn back {turns} times; {given:.0f} mm as "
-            f"they stand, {least:.0f} mm from each to its nearest); sort them along the vessel"
-        )
-    return None
-
-
-def _turns(line: Float[np.ndarray, "n 3"]) -> int:
-    step = np.diff(line, axis=0)
-    return int((np.einsum("ij,ij->i", step[1:], step[:-1]) < 0).sum())
+def _left_out(
+    whole: LineGraph, lines: list[Line], piece: Int[np.ndarray, "n"], own: int
+) -> tuple[list[str], dict[str, float]]:
+    """Return a note on each stretch of line outside the spheres of a tree's lines, and the balance: `length_mm` in all
+    is `reached_mm` by the spheres, and `left_out_mm`. `piece` is -1 in the parent vessel, and `own` in the tree."""
+    radius = np.concatenate([line.radius for line in lines])
+    gap, nearest = map(np.asarray, KDTree(np.concatenate([line.points for line in lines])).query(whole.points))
+    inside = gap <= np.maximum(radius[nearest], STEP_MM)
+    total, reached = float(whole.share.sum()), float(whole.share[inside].sum())
+    balance = {"length_mm": total, "reached_mm": reached, "left_out_mm": total - reached}
+    lost = np.flatnonzero(~inside)
+    near = KDTree(whole.points[lost]).query_pairs(2 * STEP_MM, output_type="ndarray")
+    near = near[np.diff(piece[lost[near]] < 0, axis=1)[:, 0] == 0]
+    found = []
+    for part in split(lost, pieces(near, len(lost))) if len(lost) else []:
+        length = float(np.bincount(whole.owner[part], whole.share[part]).max())  # of lines that run together one counts
+        if piece[part[0]] < 0:
+            why = "it lies in the parent vessel that the lines start in"
+        elif piece[part].max() != own:
+            why = f"no line leads there; the nearest is {gap[part].min():.1f} mm away"
+        else:
+            why = "it is no longer than the vessel it leaves is wide"
+        place = place_text(whole.points[part[gap[part].argmax()]])
+        found.append((length, f"{length:.1f} mm of line at {place} is left out: {why}"))
+    notes = longest_first(found, "{} more stretches, {:.1f} mm of line together, are left out")
+    return notes, {name: round(length, 1) for name, length in balance.items()}

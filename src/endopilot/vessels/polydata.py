@@ -18,7 +18,6 @@ from endopilot.vessels import mesh_process
 from endopilot.vessels.sources import (
     ASSUMED,
     AXES,
-    BY_ARRAYS,
     RADIUS_NAMES,
     RAS_TO_LPS,
     STATED,
@@ -32,9 +31,6 @@ from endopilot.vessels.surface import Surface
 
 _HEADER_BYTES = 65536  # statements of axes and unit stand in the first bytes of a file
 _LONGEST_S, _BYTES_A_SECOND = 30.0, 1e6  # a file that takes longer than this, and at this speed, is damaged
-
-_SIMVASCULAR = {"ModelFaceID", "BranchId", "CenterlineSectionArea", "GlobalNodeID"}
-"""Arrays that SimVascular writes into models, centerlines and meshes, all in cm."""
 
 _SPACE = re.compile(r"\bSPACE\s*[=:]\s*[\"']?([A-Za-z][A-Za-z-]*)", re.IGNORECASE)
 _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
@@ -56,9 +52,10 @@ def read_polydata(path: Path) -> AnatomySource:
     _check_whole(path, "polygons", promised, len(data.get("corners", ())))
     if not np.isfinite(points).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; export it again")
-    statement = f"{_header(path)}\n{data['fields']}"
+    with path.open("rb") as stream:
+        statement = f"{stream.read(_HEADER_BYTES).decode('latin-1')}\n{data['fields']}"
     coordinates = _coordinates(statement, path)
-    factor, odds = _factor(statement, data, notes)
+    factor, odds = _factor(statement, notes)
     if "corners" in data:
         content: Surface | Polylines = _surface(points, data["corners"], path)
         if data["kind"] == "vtkUnstructuredGrid":
@@ -101,21 +98,6 @@ def _damaged(path: Path, complaint: str) -> InputError:
     return InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({said or 'damaged'}); export it again")
 
 
-def _header(path: Path) -> str:
-    with path.open("rb") as stream:
-        text = stream.read(_HEADER_BYTES).decode("latin-1")
-    kind = path.suffix.lower()
-    if kind == ".stl":
-        return text.partition("\n")[0] if _is_ascii_stl(text) else text[:80]
-    if kind == ".vtk":
-        return "\n".join(text.splitlines()[:2])
-    if kind == ".ply":
-        return "\n".join(line for line in text.partition("end_header")[0].splitlines() if line.startswith("comment"))
-    if kind == ".obj":
-        return "\n".join(line for line in text.splitlines() if line.startswith("#"))
-    return "\n".join(re.findall(r"<!--(.*?)-->", text, re.DOTALL))
-
-
 def _coordinates(statement: str, path: Path) -> str | None:
     found = sorted({name.upper() for name in _SPACE.findall(statement)})
     axes = {AXES.get(name) for name in found}
@@ -126,22 +108,19 @@ def _coordinates(statement: str, path: Path) -> str | None:
     return axes.pop() if axes else None
 
 
-def _factor(statement: str, data: dict[str, np.ndarray], notes: list[str]) -> tuple[float, float]:
-    """Return mm in a file's unit, and how sure that is: as the header states, or as a program's own arrays tell."""
+def _factor(statement: str, notes: list[str]) -> tuple[float, float]:
+    """Return mm in the unit that a header states, and how sure that is."""
     found = sorted({name.lower() for name in _UNIT.findall(statement)})
-    known = {factor for name in found if (factor := mm_per_unit(name)) is not None}
-    if len(known) == 1 and len(found) == 1:
-        factor = known.pop()
-        if factor != 1.0:
-            notes.append(f"the header states the unit {found[0]}: multiplied by {factor:g}")
-        return factor, STATED
-    if found:
-        notes.append(f"the header states the unit {' and '.join(found)}, which is not one known length: taken for mm")
-    arrays = sorted(_SIMVASCULAR & {name.partition(":")[2] for name in data})
-    if arrays:
-        notes.append(f"the arrays {', '.join(arrays)} are SimVascular's, which works in cm: multiplied by 10")
-        return 10.0, BY_ARRAYS
-    return 1.0, ASSUMED
+    factor = mm_per_unit(found[0]) if len(found) == 1 else None
+    if factor is None:
+        if found:
+            notes.append(
+                f"the header states the unit {' and '.join(found)}, which is not one known length: taken for mm"
+            )
+        return 1.0, ASSUMED
+    if factor != 1.0:
+        notes.append(f"the header states the unit {found[0]}: multiplied by {factor:g}")
+    return factor, STATED
 
 
 def _surface(points: np.ndarray, corners: np.ndarray, path: Path) -> Surface:

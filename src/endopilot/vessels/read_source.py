@@ -39,11 +39,6 @@ _CONVERT = {
 
 _NUMBERED_AXES = {"0": "ras", "1": "lps"}  # axes by the numbers of Slicer's older files
 
-_NO_CENTERLINE = {
-    "fiducial": "its points are in no order; convert it to a curve in Slicer's Markups module",
-    "closedcurve": "a closed curve has no end to enter; save it as an open curve (type Curve)",
-}
-
 
 def read_source(path: str | Path, *, label: int | str | None = None, threshold: float | None = None) -> AnatomySource:
     """Read a vessel from a mask, a surface or centerlines; the kind follows from the file.
@@ -123,35 +118,24 @@ def _read_markups(path: Path) -> AnatomySource:
     markups = content.get("markups") if isinstance(content, dict) else None
     if not isinstance(markups, list) or not markups or not all(isinstance(markup, dict) for markup in markups):
         raise InputError(f"{path}: holds no Slicer markups; export the centerline curve as .mrk.json")
-    curves, notes, refused = [], list[str](), list[str]()
+    curves, notes, others = [], list[str](), list[str]()
     for number, markup in enumerate(markups):
-        name, kind = str(markup.get("label") or markup.get("name") or number), markup.get("type")
-        control = markup.get("controlPoints")
-        control = control if isinstance(control, list) else []
-        if (reason := _no_centerline(kind, control)) is not None:
-            refused.append(f"{kind or 'curve'} {name!r} is no centerline: {reason}")
+        name, kind = str(markup.get("label") or markup.get("name") or number), str(markup.get("type") or "Curve")
+        if kind.lower() in ("curve", "line"):
+            curves.append(_curve(markup, f"{path}: curve {name!r}", notes))
         else:
-            curves.append(_curve(markup, control, name, f"{path}: curve {name!r}", notes))
+            others.append(f"{kind} {name!r} is no centerline")
     if not curves:
-        raise InputError(f"{path}: {refused[0]}")
-    notes += [f"{reason.split(':')[0]}, and is left out" for reason in refused]
+        raise InputError(f"{path}: {others[0]}; save it as an open curve (type Curve) in Slicer's Markups module")
+    notes += [f"{other}, and is left out" for other in others]
     points, radii, axes, factors = zip(*curves, strict=True)
     lines = checked_lines(Polylines(points, radii), path, notes)
     factor = factors[0] if len(set(factors)) == 1 else 1.0
     return AnatomySource(lines, coordinates=" and ".join(sorted(set(axes))), factor=factor, notes=tuple(notes))
 
 
-def _no_centerline(kind: Any, control: list[Any]) -> str | None:
-    lower = str(kind or "Curve").lower()
-    if lower not in ("curve", "line"):
-        return _NO_CENTERLINE.get(lower, "only open curves and lines are (type Curve or Line)")
-    if len(control) < 2:
-        return f"it has {len(control)} control points; draw it through two or more"
-    return None
-
-
 def _curve(
-    markup: dict[str, Any], control: list[Any], name: str, where: str, notes: list[str]
+    markup: dict[str, Any], where: str, notes: list[str]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], str, float]:
     """Return the positions and radii of a curve, LPS mm, the axes and the mm in the unit that it states."""
     stated, unit = markup.get("coordinateSystem"), markup.get("coordinateUnits")
@@ -163,26 +147,30 @@ def _curve(
         )
     factor = _factor(unit, where)
     try:
-        given = np.array([point.get("positionStatus", "defined") == "defined" for point in control])
-        line = [[float(value) for value in control[i]["position"]] for i in np.flatnonzero(given)]
-        places = np.array(line, dtype=float)
+        control = markup["controlPoints"]
+        given = np.array([point.get("positionStatus", "defined") == "defined" for point in control], dtype=bool)
+        places = np.array([control[i]["position"] for i in np.flatnonzero(given)], dtype=float)
+        measured = {str(each.get("name")).lower(): each for each in markup.get("measurements", ())}
+        sizes = next((measured[wanted] for wanted in RADIUS_NAMES if wanted in measured), {})
+        radius = np.array(sizes.get("controlPointValues", ()), dtype=float)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{where}: a control point has no numeric position; export the curve again") from error
-    if places.ndim != 2 or places.shape[1] != 3 or len(places) < 2:
+        raise InputError(f"{where}: a position or radius is no number; export the curve again") from error
+    radius = radius[given] if radius.shape == given.shape else radius
+    if len(places) < 2 or places.shape != (radius.size, 3):
         raise InputError(
-            f"{where}: positions have the shape {places.shape}, not two or more of three numbers; "
-            "export the curve again"
+            f"{where} has positions of the shape {places.shape} and {radius.size} radii (it measures "
+            f"{', '.join(measured) or 'nothing'}), not a radius at each of two points or more; export it from Slicer's "
+            "Extract Centerline module"
         )
-    radius = _radii(markup, given, factor, where)
     if not given.all():
-        notes.append(f"curve {name!r}: {int((~given).sum())} control points without a position are left out")
-    if markup.get("type") is None:
-        notes.append(f"markup {name!r} states no type: taken for a curve")
+        notes.append(f"{where}: {int((~given).sum())} control points without a position are left out")
     if stated is None:
-        notes.append(f"curve {name!r}: axes not stated: taken for LPS, the default of the format")
+        notes.append(f"{where}: axes not stated: taken for LPS, the default of the format")
     if factor != 1.0:
-        notes.append(f"curve {name!r} states {_first(unit)}: multiplied by {factor:g}")
-    return places * (RAS_TO_LPS if axes == "ras" else 1.0) * factor, radius, axes, factor
+        notes.append(f"{where} states {_first(unit)}: multiplied by {factor:g}")
+    own = sizes.get("units")
+    turn = RAS_TO_LPS if axes == "ras" else 1.0
+    return places * turn * factor, radius.ravel() * (_factor(own, where) if own else factor), axes, factor
 
 
 def _factor(unit: Any, where: str) -> float:
@@ -195,29 +183,3 @@ def _factor(unit: Any, where: str) -> float:
 def _first(unit: Any) -> Any:
     """Return a unit's own name: newer files write it as a list of name, system and meaning."""
     return unit[0] if isinstance(unit, list) and unit else unit
-
-
-def _radii(markup: dict[str, Any], given: np.ndarray, factor: float, where: str) -> np.ndarray:
-    found = markup.get("measurements")
-    found = [m for m in found if isinstance(m, dict)] if isinstance(found, list) else []
-    measurements = {str(m.get("name", "")).lower(): m for m in found if m.get("controlPointValues")}
-    chosen = next((measurements[wanted] for wanted in RADIUS_NAMES if wanted in measurements), None)
-    if chosen is None:
-        held = ", ".join(str(m.get("name")) for m in found) or "no measurements at all"
-        raise InputError(
-            f"{where} has no radius measurement for its {len(given)} control points (it holds {held}); "
-            "export it from Slicer's Extract Centerline module"
-        )
-    try:
-        values = np.array([float(value) for value in chosen["controlPointValues"]])
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{where}: a radius is no number; export the curve again") from error
-    if len(values) == len(given):
-        values = values[given]
-    elif len(values) != given.sum():
-        raise InputError(
-            f"{where} has {len(values)} radii for {len(given)} control points; export it again from "
-            "Slicer's Extract Centerline module"
-        )
-    unit = chosen.get("units")
-    return values * (factor if unit in (None, "") else _factor(unit, where))

@@ -16,8 +16,9 @@ from endopilot.types import Insertion, Volume
 from endopilot.vessels.graph import split
 from endopilot.vessels.inlet import COMPARABLE, Vessel, piece_on_side
 from endopilot.vessels.medial_lines import MedialLines, piece_labels
+from endopilot.vessels.remarks import NOTED_MM, longest_first
 from endopilot.vessels.surface import filled_box
-from endopilot.vessels.topology import MOST_LISTED, SMALLEST_PIECE, Touch, parted, touch_remarks
+from endopilot.vessels.topology import SMALLEST_PIECE, Touch, parted, touch_remarks
 
 NEAR_OSTIUM_MM = 5.0  # a lumen farther than this from a given ostium does not belong to it
 LARGEST_GAP_VOXELS = 4.0  # pieces of a mask that are this near each other are taken for one interrupted vessel
@@ -25,38 +26,29 @@ LARGEST_GAP_VOXELS = 4.0  # pieces of a mask that are this near each other are t
 _DIRECTION_VOXELS = 12.0  # a piece's direction at its end is that of its voxels within this distance
 _ONWARDS = 0.5  # cosine of the largest angle between a piece and the gap that it is joined across
 
-NOTED_MM = 5.0  # what is left out or widened gets a remark of its own from this length; shorter pieces are summed up
-
 _MOST_JOINED = 200  # at most this many pieces of a mask are looked at as vessels or parts of them
 
-OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
+_OTHER_SIDE = {"rca": "left coronary artery", "lca": "right coronary artery"}
 
 
 @dataclass(frozen=True, eq=False)
 class Lumen:
-    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out.
-
-    `before` is the middle of all that the file connects with it, which the tree should reach; `told` those points of it
-    that lie in another vessel, parted from this one with a remark.
-    """
+    """One lumen of a mask, ready for its wall, with its middle and remarks on what was joined, parted and left out."""
 
     mask: Volume
     lines: MedialLines
-    before: MedialLines
-    told: Bool[np.ndarray, "_"]
     notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, with its middle `before`, and
-    `parted` where they touch, with its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
+    """The pieces of a mask: `joined` over gaps of a few voxels to what carries on, and `parted` where they touch, with
+    its middle `lines`; `gaps` has a voxel at each, and whether it was joined."""
 
     joined: Volume
     gaps: list[tuple[Int[np.ndarray, "3"], bool]]
     parted: Volume
     touches: list[Touch]
-    before: MedialLines
     lines: MedialLines
 
 
@@ -75,13 +67,12 @@ def connected_mask(
     given: Insertion | None,
     label: str,
     vessel: Vessel = "generic",
-    other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> Lumen:
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
     Places where it touches itself are parted (`topology.parted`). Where a mask holds both coronary arteries and no
-    ostium is given, `vessel` decides by the patient's side. Ostia are in LPS mm. Raises InputError for a mask that is
-    empty, full, a solid block or noise, or that touches nothing near the given ostium.
+    ostium is given, `vessel` decides by the patient's side. Raises InputError for a mask that is empty, full, a solid
+    block or noise, or that touches nothing near the given ostium (LPS mm).
     """
     if not mask.voxels.any():
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
@@ -93,7 +84,7 @@ def connected_mask(
     index = np.argwhere(whole.parted.voxels)
     pieces = split(whole.parted.index_to_world(index[:, ::-1].astype(float)), labels[tuple(index.T)] - 1)
     sizes = np.array([len(piece) for piece in pieces])
-    main, gap, nearest, others = chosen_piece(pieces, sizes, given, vessel)
+    main, gap, nearest = chosen_piece(pieces, sizes, given, vessel)
     if gap > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
         raise InputError(
             f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "  # pyright: ignore[reportOptionalMemberAccess]
@@ -110,7 +101,7 @@ def connected_mask(
         remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
     if joints.count(True):
         remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
-    remarks += pieces_left_out(pieces, [main], severed, others, vessel, other_ostium, "voxels")
+    remarks += pieces_left_out(pieces, [main], severed, vessel, "voxels")
     box = filled_box(result)
     corner = np.array([part.start for part in box])
     closed = _filled(result[box])
@@ -118,9 +109,7 @@ def connected_mask(
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
     lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
     lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
-    before = whole.before.within(own[tuple(whole.before.index.T)], corner)
-    told = np.isin(labels[tuple((before.index + corner).T)] - 1, severed)
-    return Lumen(lumen, lines, before, told, remarks)
+    return Lumen(lumen, lines, remarks)
 
 
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
@@ -147,73 +136,48 @@ def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -
 
 def chosen_piece(
     pieces: list[Float[np.ndarray, "_ 3"]], sizes: Shaped[np.ndarray, "p"], given: Insertion | None, vessel: Vessel
-) -> tuple[int, float, Float[np.ndarray, "3"], list[int]]:
-    """Return the piece at the ostium, how far away it is, mm, and where; and which other pieces are nearly as large.
-    Without an ostium it is that on the vessel's side (`piece_on_side`). A speck of noise is no piece."""
+) -> tuple[int, float, Float[np.ndarray, "3"]]:
+    """Return the piece at the ostium, or without one that on the vessel's side (`piece_on_side`), how far away it is,
+    mm, and where. A speck of noise is no piece."""
     if given is None:
-        main, others = piece_on_side(sizes.astype(float), np.array([piece.mean(axis=0) for piece in pieces]), vessel)
-        return main, 0.0, pieces[main][0], others
+        main = piece_on_side(sizes.astype(float), np.array([piece.mean(axis=0) for piece in pieces]), vessel)
+        return main, 0.0, pieces[main][0]
     found = []
     for number, piece in enumerate(pieces):
         if len(piece) >= min(SMALLEST_PIECE, max(map(len, pieces))):
             gap = np.linalg.norm(piece - given.position, axis=1)
             found.append((float(gap.min()), number, int(gap.argmin())))
     gap, main, at = min(found)
-    return main, gap, pieces[main][at], []
+    return main, gap, pieces[main][at]
 
 
 def pieces_left_out(
     pieces: list[Float[np.ndarray, "_ 3"]],
     taken: list[int],
     severed: Int[np.ndarray, "_"],
-    others: list[int],
     vessel: Vessel,
-    other_ostium: Float[np.ndarray, "3"] | None,
     counted: str,
 ) -> list[str]:
     """Say which pieces (points, LPS mm, of `counted`) were left out and where they lie: a real vessel may be lost with
-    them. The lumen is made of `taken`; `severed` touched it and were parted from it; `others` are nearly as large."""
-    remarks, foreign = list[str](), -1
-    lost = [number for number in range(len(pieces)) if number not in taken]
-    if lost and other_ostium is not None:
-        number, gap, *_ = chosen_piece(pieces, np.array([]), Insertion(other_ostium, np.zeros(3)), vessel)
-        if gap < NEAR_OSTIUM_MM and number in lost:
-            foreign = number
-            lost.remove(foreign)
-            remarks.append(f"the {OTHER_SIDE[vessel]} ({len(pieces[foreign])} {counted}) is not part of this one")
-    if apart := set(others) - {foreign, *taken, *severed.tolist()}:
-        choice = (
-            "the largest was taken: for coronary arteries give --vessel rca or lca"
-            if vessel == "generic"
-            else f"the one on the {vessel.upper()}'s side was taken"
-        )
-        lie = "1 other large piece lies" if len(apart) == 1 else f"{len(apart)} other large pieces lie"
-        remarks.append(f"{lie} apart and {choice}; --ostium-mm chooses another")
-    lumen = np.concatenate([pieces[number] for number in taken])
-    extent = {number: float(np.linalg.norm(np.ptp(pieces[number], axis=0))) for number in lost}
-    order = sorted(lost, key=lambda number: -extent[number])
-    listed = [number for number in order[:MOST_LISTED] if extent[number] >= NOTED_MM]
-    reach = KDTree(lumen if listed else lumen[:1])
-    for number in listed:
+    them. The lumen is made of `taken`; `severed` touched it and were parted from it."""
+    lumen, reach, found = np.concatenate([pieces[number] for number in taken]), None, []
+    for number in (number for number in range(len(pieces)) if number not in taken):
         place = pieces[number]
+        extent, kind = float(np.linalg.norm(np.ptp(place, axis=0))), "a piece apart from the lumen"
+        if extent < NOTED_MM:  # is told with others at most
+            found.append((extent, kind))
+            continue
+        reach = reach or KDTree(lumen)
         some = np.asarray(reach.query(place[:: len(place) // 64 + 1])[0]).min()  # so that far points end a search early
         gap = np.asarray(reach.query(place, distance_upper_bound=some + 1e-6)[0])
-        at, kind = place_text(place[gap.argmin()]), "a piece apart from the lumen"
-        begins = f"begins {gap.min():.1f} mm away at {at}"
         if number in severed:
-            kind, begins = "another vessel that touches this one", f"touches it at {at}"
+            kind = "another vessel that touches this one"
         elif len(place) >= COMPARABLE * len(lumen):
-            other = (
-                f"perhaps the {OTHER_SIDE[vessel]}" if vessel in OTHER_SIDE else "or a part not connected in the file"
-            )
-            kind = f"another vessel, {other}, apart from the lumen"
-        remarks.append(f"{kind} left out ({len(place)} {counted}): it is {extent[number]:.0f} mm long and {begins}")
-    if rest := order[len(listed) :]:
-        kind = "piece" if len(rest) == 1 else "pieces"
-        kind = f"more {kind}" if listed else f"{kind} apart from the lumen"
-        size = sum(len(pieces[number]) for number in rest)
-        remarks.append(f"{len(rest)} {kind} of up to {extent[rest[0]]:.0f} mm left out ({size} {counted})")
-    return remarks
+            kind = f"another vessel, perhaps the {_OTHER_SIDE[vessel]}," if vessel in _OTHER_SIDE else "another vessel"
+            kind += " apart from the lumen, which --ostium-mm chooses,"
+        where = f"begins {gap.min():.1f} mm away at {place_text(place[gap.argmin()])}"
+        found.append((extent, f"{kind} left out ({len(place)} {counted}): it is {extent:.0f} mm long and {where}"))
+    return longest_first(found, "{} more pieces apart from the lumen, {:.0f} mm together, left out")
 
 
 def _joined(

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError, place_text
 from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
-from endopilot.vessels.coverage import voxelised
+from endopilot.vessels.coverage import touched, voxelised
 from endopilot.vessels.graph import pieces, split
 from endopilot.vessels.inlet import Vessel
 from endopilot.vessels.repair import NEAR_OSTIUM_MM, chosen_piece, pieces_left_out
@@ -46,7 +46,6 @@ def closed_surface(
     given: Insertion | None,
     label: str,
     vessel: Vessel = "generic",
-    other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or that at the ostium), holes capped; arguments as of
     `connected_mask`. Raises InputError for holes that cannot be closed, or a surface nowhere near the ostium."""
@@ -59,11 +58,11 @@ def closed_surface(
     if ids.max() > 0:
         places = split(np.asarray(regions.points, dtype=float), ids)
         sizes = np.array([np.linalg.norm(np.ptp(place, axis=0)) * len(place) ** 0.5 for place in places])
-        chosen, *_, others = chosen_piece(places, sizes, given, vessel)
+        chosen, *_ = chosen_piece(places, sizes, given, vessel)
         joined, mesh = _united(regions, ids, chosen)
         if len(joined) > 1:
             remarks.append(f"{len(joined)} closed surfaces overlap: united to one vessel")
-        remarks += pieces_left_out(places, joined, np.empty(0, int), others, vessel, other_ostium, "vertices")
+        remarks += pieces_left_out(places, joined, np.empty(0, int), vessel, "vertices")
     if given is not None:
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
@@ -191,29 +190,24 @@ def _from_shell(surface: Surface, label: str) -> Surface:
     """Close a surface that no cap closes: voxels from which its wall is met in most directions are inside."""
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(float(np.prod(extent) / 3e6) ** (1 / 3), float(extent.max()) / 600)
-    fine = surface.refined(0.7 * spacing)
-    margin = 6
-    origin = fine.vertices.min(axis=0) - margin * spacing
-    shape = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
-    shell = np.zeros(tuple(shape[::-1]), dtype=bool)
-    samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
-    index = np.rint((samples - origin) / spacing).astype(int)
-    shell[index[:, 2], index[:, 1], index[:, 0]] = True
-    inside = np.asarray(binary_opening(_enclosed(shell)), dtype=bool)
-    if inside.sum() > _HOLDS * shell.sum():
-        inside = np.asarray(binary_dilation(inside), dtype=bool) & (inside | shell)
-        return surface_from_mask(Volume(inside, np.full(3, spacing), origin, np.eye(3)))
+    shell = touched(surface, spacing, 6)
+    inside = np.asarray(binary_opening(_enclosed(shell.voxels)), dtype=bool)
+    if inside.sum() > _HOLDS * shell.voxels.sum():
+        inside = np.asarray(binary_dilation(inside), dtype=bool) & (inside | shell.voxels)
+        return surface_from_mask(replace(shell, voxels=inside))
     raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")
 
 
 def _lumen_in_wall(mask: Volume) -> tuple[Bool[np.ndarray, "nz ny nx"], float] | None:
     """Return the void that a wall encloses, closed or open at the ends, and the wall's thickness, mm; None if none."""
+    from skimage.measure import block_reduce
+
     box = filled_box(mask.voxels)
     solid = np.asarray(mask.voxels[box], dtype=bool)
     if solid.size == 0:
         return None
     factor = int(np.ceil((solid.size / _MOST_VOXELS) ** (1 / 3)))
-    coarse = _blocks(solid, factor)
+    coarse = np.asarray(block_reduce(solid, factor, np.any), dtype=bool)  # pyright: ignore[reportArgumentType]
     edges = mask.spacing_mm[::-1] * factor
     void = _enclosed(coarse)
     labels = connected_components(void, corners=False)
@@ -249,12 +243,6 @@ def without_wall(mask: Volume) -> tuple[Volume, list[str]]:
 
 def _wall_text(thickness_mm: float) -> str:
     return f"what is given is a wall of {thickness_mm:.1f} mm: the lumen inside it is taken"
-
-
-def _blocks(solid: Bool[np.ndarray, "nz ny nx"], factor: int) -> Bool[np.ndarray, "a b c"]:
-    padded = np.pad(solid, [(0, -size % factor) for size in solid.shape])
-    shape = [part for size in padded.shape for part in (size // factor, factor)]
-    return np.asarray(padded.reshape(shape).any(axis=(1, 3, 5)))
 
 
 def _enclosed(solid: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:

@@ -42,9 +42,9 @@ _LONGER_SD, _SHORTER_SD = 0.3, 0.9  # spread of ln(extent) of a kind; a file may
 _UNITS = {"mm": 1.0, "cm": 10.0, "inches": 25.4, "dm": 100.0, "m": 1000.0, "tenths of mm": 0.1, "µm": 0.001}
 _RARE = {"tenths of mm": 0.02, "µm": 0.02}  # how likely a unit is against cm, before the sizes are looked at
 
-ASSUMED, BY_ARRAYS, STATED, ANSWERED = 4.0, 100.0, 1e4, 1e6
-"""How much likelier a file's unit is what it was taken for than any other: by default, since arrays of a program that
-has a usual unit are in it, since the file states the unit, and since the user did."""
+ASSUMED, STATED, ANSWERED = 4.0, 1e4, 1e6
+"""How much likelier a file's unit is what it was taken for than any other: by default, since the file states the unit,
+and since the user did."""
 
 _CERTAIN, _FITS = 0.9, 0.05
 """A unit less probable than the first is asked for; the message names what has this share of the best one's chances."""
@@ -141,31 +141,25 @@ def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
 
 
 def checked_lines(lines: Polylines, path: Path, notes: list[str]) -> Polylines:
-    """Return centerlines whose positions are finite and whose radii are positive; InputError where they are not. Where
-    the radius is no number or zero only at the end of a line, it becomes that of the point before, with a note."""
+    """Return centerlines whose positions are finite and whose radii are positive; InputError where they are not. Radii
+    that are none at the end of a line become that of the point before, with a note."""
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
-    if all((radius == 0).all() for radius in lines.radius):
-        raise InputError(f"{path}: all radii are zero; write inscribed-sphere radii in mm")
     radii = []
     for number, (points, radius) in enumerate(zip(lines.points, lines.radius, strict=True)):
         if not np.isfinite(points).all():
             raise InputError(f"{path}: {lines.name(number)}: some positions are not finite numbers; export it again")
-        good = np.flatnonzero(np.isfinite(radius) & (radius > 0))
-        bad = np.setdiff1d(np.arange(len(radius)), good)
-        if len(bad):
-            odd = bad[(radius[bad] < 0) | ((bad > good[0]) & (bad < good[-1]))] if len(good) else bad
-            if len(odd):
-                raise InputError(
-                    f"{path}: {lines.name(number)}: the radius at {place_text(points[odd[0]])} is {radius[odd[0]]:g} "
-                    f"({len(odd)} such points); write inscribed-sphere radii, which are positive"
-                )
-            notes.append(
-                f"{lines.name(number)}: the radius of {len(bad)} points at its end, from {place_text(points[bad[0]])}, "
-                "is no positive number: that of the point before is taken"
+        good = np.isfinite(radius) & (radius > 0)
+        last = int(np.flatnonzero(good)[-1]) if good.any() else -1
+        if not good[: last + 1].all() or last < 0:
+            bad = int(np.argmin(good))
+            raise InputError(
+                f"{path}: {lines.name(number)}: the radius at {place_text(points[bad])} is {radius[bad]:g}; write "
+                "inscribed-sphere radii in mm, which are positive"
             )
-            radius = radius[good[np.abs(good - np.arange(len(radius))[:, None]).argmin(axis=1)]]
-        radii.append(radius)
+        if not good.all():
+            notes.append(f"{lines.name(number)}: its last {len(good) - 1 - last} radii are none: that before is taken")
+        radii.append(np.where(good, radius, radius[last]))
     return replace(lines, radius=tuple(radii))
 
 
@@ -188,11 +182,11 @@ def check_unit(
     factor: float = 1.0,
     odds: float = STATED,
 ) -> None:
-    """Refuse a vessel (points on it, or its box's corners, in mm by `factor`) of another size than vessels have, and
-    ask with the `--scale`s where several units fit.
+    """Refuse a vessel (points on it, or its box's corners, in mm by `factor`) of another size than vessels have, or one
+    that several units fit, with the sizes in each and its `--scale`.
 
     Radius and extent together tell the unit, each weighed by how usual it makes the two against the nearest kind of
-    vessel; `odds` (`ASSUMED`, `BY_ARRAYS`, `STATED`, `ANSWERED`) favour the one it was taken in.
+    vessel; `odds` (`ASSUMED`, `STATED`, `ANSWERED`) favour the one it was taken in.
     """
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     units = {factor: unit_name(factor)} | {one: name for name, one in _UNITS.items()}
@@ -206,14 +200,11 @@ def check_unit(
     if certain >= _CERTAIN or (radius_mm is None and chance[factor] >= _FITS * best > 0.0):
         return
     fits = [one for one in units if chance[one] >= max(_FITS * best, _NONE)]
-    if factor in fits and len(fits) > 1:
-        sizes = (f"{_size(radius_mm, extent, one / factor)} in {units[one]} (--scale {one:g})" for one in fits)
-        raise InputError(f"{label}: states no unit: its vessel {', or '.join(sizes)}; say which, with --scale")
-    text = f"{label}: {_size(radius_mm, extent, 1.0)}, as no vessel does; "
-    if not fits or factor in fits:
-        raise InputError(text + "check the label and the units of positions and radii (--scale)")
-    named, scales = " or ".join(units[one] for one in fits), " or --scale ".join(f"{one:g}" for one in fits)
-    raise InputError(f"{text}the file seems to be in {named}: use --scale {scales}")
+    if not fits or fits == [factor]:
+        mend = "check the label and the units of positions and radii (--scale)"
+        raise InputError(f"{label}: {_size(radius_mm, extent, 1.0)}, as no vessel does; {mend}")
+    sizes = (f"{_size(radius_mm, extent, one / factor)} in {units[one]} (--scale {one:g})" for one in fits)
+    raise InputError(f"{label}: its vessel {', or '.join(sizes)}; say which, with --scale")
 
 
 def _size(radius_mm: float | None, extent_mm: float, factor: float) -> str:

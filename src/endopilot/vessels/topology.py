@@ -14,7 +14,6 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,6 +28,7 @@ from endopilot.types import Volume
 from endopilot.vessels.graph import pieces
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.medial_lines import SMALLEST_PIECE, MedialLines, piece_labels, thinned_lines, traced_lines
+from endopilot.vessels.remarks import MOST_LISTED
 
 CONTACT = 0.6  # a place with less clearance than this share of both sides' is a contact, not a stenosis
 
@@ -36,9 +36,7 @@ SHORTEST_LOOP_MM = 20.0
 """Loops from this length are cut. In shorter ones two branches touch again just behind their fork, or a wall has a
 hole: which way a line takes hardly matters."""
 
-SHORTEST_TUNNEL_MM = 6.0  # tunnels shorter than this, or no longer than round the vessel itself, are rough voxels
-MOST_LISTED = 8  # as many places or pieces are listed one by one
-_SLIT_VOXELS = 3.0  # so are those whose opposite sides come as near each other as this, in voxels
+_SLIT_VOXELS = 3.0  # no loop are tunnels whose opposite sides come as near each other as this, in voxels
 
 _APART, _STRAIGHT = (0.35, 0.5, 0.8), (0.6, 0.8)
 """Axes that stay apart by these shares of both radii together: of one vessel that touches itself, of two that perhaps
@@ -57,45 +55,13 @@ _MOST_RINGS = 8
 """A lumen with more rings is no vessel that touches itself, and is left as it is: a dissection's two lumens have 48
 between rough tears, generated flaps have 5 at most."""
 
-Kind = Literal["itself", "loop", "side", "vessels", "perhaps", "flap", "hole", "porous", "round"]
-
-_SAID: dict[Kind, tuple[str, str]] = {
-    "itself": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
-    "loop": ("a tree holds no loops: cut at the narrowest place", " (loop of {:.0f} mm)"),
-    "side": ("distant parts of the vessel touch over some length and were parted around", " (over {:.0f} mm)"),
-    "vessels": ("two vessels touch and were parted at", ""),
-    "perhaps": ("two vessels may touch, or one forks; they were left joined at", ""),
-    "flap": ("a wall inside the vessel, such as a flap, was left with its openings at", " (ring of {:.0f} mm)"),
-    "hole": ("tunnels were left as they are, at", " ({:.0f} mm around)"),
-    "porous": (
-        "the lumen closes on itself in many places, as those of a dissection do at tears: they were left open, and the "
-        "tree takes one way round each; rings begin at",
-        " ({:.0f} mm)",
-    ),
-    "round": ("the lumen closes a loop, of which a tree takes one way round; it is narrowest at", " ({:.0f} mm)"),
-}
-
-_LEFT: dict[Kind, Kind | None] = {
-    "itself": "perhaps",
-    "side": "perhaps",
-    "vessels": "perhaps",
-    "loop": "round",
-    "hole": None,
-}
-"""What is said of a wall, of which nothing is parted; small tunnels are its voxels'."""
-
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A place (LPS mm) where a mask touches itself or closes a loop, and what was made of it.
+    """A place (LPS mm) where a mask touches itself or another vessel, or closes a loop, and if it was parted there;
+    `size_mm` is the length of the vessel between the two sides, or of the contact, 0 if unknown."""
 
-    Attributes:
-        kind: parted: the vessel touches itself, a loop is narrowest, distant parts lie side by side, two vessels touch;
-            left: two vessels perhaps touch, a flap has an opening, a tunnel is small, or there are many rings.
-        size_mm: length of the vessel between the two sides, or of the contact.
-    """
-
-    kind: Kind
+    parted: bool
     place: Float[np.ndarray, "3"]
     size_mm: float = 0.0
 
@@ -134,52 +100,44 @@ class _Ring:
     around_mm: float
 
 
-def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines, MedialLines]:
-    """Return the mask parted where it touches itself, all its contacts and loops, and its middle before and after. No
-    part loses its way to the rest, except one of two vessels that certainly only touch."""
+def parted(mask: Volume) -> tuple[Volume, list[Touch], MedialLines]:
+    """Return the mask parted where it touches itself, all its contacts and loops, and its middle then. No part loses
+    its way to the rest, except one of two vessels that certainly only touch."""
     parting, before = _Parting(mask), traced_lines(mask)
     for _ in range(_ROUNDS):
         thin = thinned_lines(parting.result)  # has all loops, but not all ends
         lines = before if parting.result is mask else traced_lines(parting.result)
         rings = _rings(thin, mask)
-        long = [ring for ring in rings if ring.around_mm >= SHORTEST_LOOP_MM]
-        if parting.result is mask and len(porous := _porous(mask, thin, long)) > _MOST_RINGS:
-            return mask, porous, before, before
-        crossings = itertools.chain(_crossings(thin, long), _crossings(lines, []))
-        opened = sum([parting.crossing(each, thin, long) for each in crossings])
-        opened = opened or sum([parting.ring(each, thin) for each in long])
-        if not opened:
-            for ring in rings:
-                if ring.around_mm < SHORTEST_LOOP_MM:
-                    parting.say("hole", thin.local[ring.nodes[0]], ring.around_mm)
+        if parting.result is mask and len(rings) > _MOST_RINGS:
+            every = _Parting(mask)
+            for ring in sorted(rings, key=lambda ring: -ring.around_mm):
+                every.say(False, thin.local[ring.nodes[0]], ring.around_mm)
+            if len(every.found) > _MOST_RINGS:
+                return mask, every.found, before
+        crossings = itertools.chain(_crossings(thin, rings), _crossings(lines, []))
+        opened = sum([parting.crossing(each, thin, rings) for each in crossings])
+        if not (opened or sum([parting.ring(each, thin) for each in rings])):
             break
     result = parting.result
     lines = before if result is mask else traced_lines(result)
     if aside := _without_sides(result, lines):
         result, lines = aside[0], traced_lines(aside[0])
         parting.found.append(aside[1])
-    return result, parting.found, before, lines
-
-
-def _porous(mask: Volume, thin: MedialLines, rings: list[_Ring]) -> list[Touch]:
-    parting = _Parting(mask)
-    for ring in sorted(rings, key=lambda ring: -ring.around_mm):
-        parting.say("porous", thin.local[ring.nodes[0]], ring.around_mm)
-    return parting.found
+    return result, parting.found, lines
 
 
 def touch_remarks(found: list[Touch], *, parted: bool = True) -> list[str]:
-    """Return remarks on where a lumen touches itself: one a kind, the largest first, other words if not parted."""
-    kinds = [touch.kind if parted else _LEFT.get(touch.kind, touch.kind) for touch in found]
+    """Return remarks on where a lumen touches itself: on what was parted, and on what was not, the largest first."""
     remarks = []
-    for kind, (text, size) in _SAID.items():
-        own = sorted(
-            (touch for touch, told in zip(found, kinds, strict=True) if told == kind), key=lambda t: -t.size_mm
-        )
-        places = [place_text(touch.place) + size.format(touch.size_mm) * (touch.size_mm > 0) for touch in own]
+    for done, answer in ((True, "was parted"), (False, "was left joined")):
+        own = sorted((t for t in found if (t.parted and parted) == done), key=lambda touch: -touch.size_mm)
+        places = [place_text(t.place) + f" ({t.size_mm:.0f} mm around)" * (t.size_mm > 0) for t in own]
         if places:
             more = f" and {len(places) - MOST_LISTED} places more" if len(places) > MOST_LISTED else ""
-            remarks.append(f"{text} {', '.join(places[:MOST_LISTED])}{more}")
+            remarks.append(
+                "the lumen touches itself or another vessel, or closes a loop, and "
+                f"{answer} at {', '.join(places[:MOST_LISTED])}{more}"
+            )
     return remarks
 
 
@@ -190,37 +148,37 @@ class _Parting:
         self.mask, self.edges = mask, mask.spacing_mm[::-1]
         self.result, self.found = mask, list[Touch]()
 
-    def say(self, kind: Kind, place: Float[np.ndarray, "3"], size_mm: float = 0.0) -> None:
+    def say(self, parted: bool, place: Float[np.ndarray, "3"], size_mm: float = 0.0) -> None:
         """Keep what was found at a place, along the mask's own axes, unless something is said of it."""
         at = self.mask.index_to_world((place / self.edges)[::-1])
         if all(np.linalg.norm(at - touch.place) >= _SAME_PLACE_MM for touch in self.found):
-            self.found.append(Touch(kind, at, size_mm))
+            self.found.append(Touch(parted, at, size_mm))
 
     def crossing(self, crossing: _Crossing, lines: MedialLines, rings: list[_Ring]) -> bool:
         """Part two lines that run past each other, if nothing is lost by it, and return whether that was done."""
         across = np.linspace(*crossing.nearest, 12)
         neck, flap = self._neck(crossing.place, sum(crossing.radii), across)
         if flap:
-            self.say("flap", crossing.place)
+            self.say(False, crossing.place)
             return False
         rim = _rim(self.result.voxels, self.edges, crossing)
         trial = replace(self.mask, voxels=self.result.voxels & ~rim)
         one, two, whole = self._held(trial, crossing)
-        kind: Kind = "perhaps"
-        if whole and one == two and _count(trial) <= _count(self.result) and _are_apart(trial, self.edges, crossing):
-            kind = "itself"
-        elif whole and one != two and crossing.certain and neck < CONTACT * min(crossing.radii):
+        itself = one == two
+        if itself:
+            part = whole and _count(trial) <= _count(self.result) and _are_apart(trial, self.edges, crossing)
+        elif part := whole and crossing.certain and neck < CONTACT * min(crossing.radii):
             one, two, _ = self._held(replace(self.mask, voxels=self.mask.voxels & ~rim), crossing)
-            kind = "vessels" if one != two else "perhaps"
-        if kind == "perhaps" and not crossing.likely:
+            part = one != two
+        if not part and not crossing.likely:
             return False
         place = np.argwhere(rim).mean(axis=0) * self.edges if rim.any() else crossing.place
         reach = sum(crossing.radii)
         through = [r.around_mm for r in rings if cdist(lines.local[r.nodes], [place]).min() < reach]
-        self.say(kind, place, min(through, default=0.0) if kind == "itself" else 0.0)
-        if kind != "perhaps":
+        self.say(part, place, min(through, default=0.0) if part and itself else 0.0)
+        if part:
             self.result = trial
-        return kind != "perhaps"
+        return part
 
     def _held(self, mask: Volume, crossing: _Crossing) -> tuple[int, int, bool]:
         """Return which pieces two lines lie in, and whether either lies in one piece from end to end."""
@@ -234,15 +192,14 @@ class _Parting:
         clearance, ends = lines.radius[ring.nodes], ring.nodes[[0, -1]]
         place = lines.local[ends].mean(axis=0)
         if self._neck(place, 2.0 * float(np.median(clearance)), place[None])[1]:
-            self.say("flap", place, ring.around_mm)
+            self.say(False, place, ring.around_mm)
             return False
         trial = replace(self.mask, voxels=self.result.voxels.copy())
         _sever(trial.voxels, lines, (int(ends[0]), int(ends[1])))
         if _count(trial) > _count(self.result):
-            self.say("hole", place, ring.around_mm)
+            self.say(False, place, ring.around_mm)
             return False
-        narrow = float(lines.radius[ends].min()) < CONTACT * float(np.median(clearance))
-        self.say("itself" if narrow else "loop", place, ring.around_mm)
+        self.say(True, place, ring.around_mm)
         self.result = trial
         return True
 
@@ -277,7 +234,7 @@ def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
         around = float(lines.lengths(np.column_stack([nodes, np.roll(nodes, 1)])).sum())
         across = np.linalg.norm(lines.points[nodes] - np.roll(lines.points[nodes], len(nodes) // 2, axis=0), axis=1)
         wide = 2 * np.pi * float(np.quantile(lines.radius[nodes], 0.9))
-        if across.min() >= _SLIT_VOXELS * mask.spacing_mm.max() and around >= max(SHORTEST_TUNNEL_MM, wide):
+        if across.min() >= _SLIT_VOXELS * mask.spacing_mm.max() and around >= max(SHORTEST_LOOP_MM, wide):
             rings.append(_Ring(nodes, around))
     return rings
 
@@ -482,4 +439,4 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, Touch] | N
     trial.voxels[tuple(index[rim].T)] = False
     if length < _SIDE_BY_SIDE_MM or _count(trial) > _count(mask):
         return None
-    return trial, Touch("side", mask.index_to_world(index[rim][:, ::-1].mean(axis=0)), length)
+    return trial, Touch(True, mask.index_to_world(index[rim][:, ::-1].mean(axis=0)), length)

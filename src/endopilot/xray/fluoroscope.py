@@ -9,11 +9,12 @@ view. docs/concepts/exposure.md says where the numbers come from.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
@@ -123,14 +124,6 @@ class FluoroscopeConfig:
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
 
 
-class _Detection(NamedTuple):
-    """A tip found at a pixel; `whiten` turns an error into parts along and across the wire, standard deviations."""
-
-    view: View
-    pixel: Float[np.ndarray, "2"]
-    whiten: Float[np.ndarray, "2 2"]
-
-
 def measurement_at(
     project: TipProjector,
     anatomy: Anatomy,
@@ -180,22 +173,7 @@ class Fluoroscope:
         """Bring the middle of the vessel to the isocenter; `wire_radius_mm` is the tip's, the rest as `CArm` says."""
         self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
         self.known_motion, self.registration_mm = known_motion, registration_mm
-        lines = [branch.centerline for branch in anatomy.tree.branches]
-        insertion = anatomy.insertion
-        behind = np.linspace(-_CATHETER_MM, -0.5, 40)
-        points = [line.points for line in lines]
-        catheter = insertion.position + behind[:, None] * insertion.direction
-        isocenter = np.concatenate(points).mean(axis=0)
-        shown = self._config.view_angles_deg[: 2 if self._config.biplane else 1]
-        self._views = [view_at(angles, isocenter, self._config.geometry) for angles in shown]
-        radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
-        # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
-        wider = _UNCLAMPED if len(self._views) > 1 else 1.0
-        self._lateral_sd = [wider * np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
-        self._points = [catheter, *points]
-        self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
-        self._abscissa = [behind, *(line.abscissa for line in lines)]
-        self._shown = [[view.project(line) for line in self._points] for view in self._views]
+        self._finder = TipFinder([(anatomy, wire_radius_mm)], self._config)
         self._project = TipProjector(anatomy.tree, anatomy.insertion)
 
     def expose(
@@ -229,8 +207,13 @@ class Fluoroscope:
             inserted_length: Δ by the robot's encoder, mm.
             random: where the errors are drawn from.
         """
-        found = self._likeliest(tip_position, tip_direction, inserted_length, random)
-        return measurement_at(self._project, self._anatomy, *found)
+        noise = random.standard_normal((len(self._finder.views[0]), 2))[None]
+        given = tip_position[None], tip_direction[None], np.array([inserted_length])
+        _, places, cost, information = self._finder.find(np.zeros(1, dtype=int), *given, noise)
+        covariances = np.linalg.inv(information)
+        # The likelihood of a place is that of its best point by the volume of its errors.
+        weight = np.exp(0.5 * (cost[0] - cost)) * np.sqrt(np.linalg.det(covariances))
+        return measurement_at(self._project, self._anatomy, places, covariances, weight)
 
     def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
@@ -242,7 +225,7 @@ class Fluoroscope:
         insertion, pixel_sd = self._anatomy.insertion, self._config.pixel_sd
         ends = insertion.position - np.array([[0.0], [_CATHETER_MM]]) * axis
         information = np.eye(3) / _LEAN_SD**2
-        for view in self._views:
+        for view in self._finder.views[0]:
             pixels = view.project(ends) + pixel_sd * random.standard_normal((2, 2))
             one, other = np.column_stack([pixels, np.full(2, view.scale)]) @ view.axes
             normal = np.cross(one, other)
@@ -252,93 +235,157 @@ class Fluoroscope:
         found = np.linalg.solve(information, insertion.direction / _LEAN_SD**2)
         return found / np.linalg.norm(found)
 
-    def locate(
-        self,
-        tip_position: Float[np.ndarray, "3"],
-        tip_direction: Float[np.ndarray, "3"],
-        inserted_length: float,
-        random: np.random.Generator,
-    ) -> Float[np.ndarray, "3"]:
-        """Return the position, LPS mm, that `measure` finds."""
-        return self._likeliest(tip_position, tip_direction, inserted_length, random)[0][0]
 
-    def _detect(
-        self,
-        view: View,
-        position: Float[np.ndarray, "3"],
-        direction: Float[np.ndarray, "3"],
-        random: np.random.Generator,
-    ) -> _Detection:
-        """Return where the tip is found in the image: the error is larger along the wire than across it."""
-        slope = view.slope(position) @ direction
-        along = slope / max(float(np.linalg.norm(slope)), 1e-9)
-        axes = np.array([along, [-along[1], along[0]]])
-        sd = np.array([self._config.along_sd, self._config.pixel_sd])
-        error = random.standard_normal(2) * sd
-        return _Detection(view, view.project(position) + error @ axes, axes / sd[:, None])
+class TipFinder:
+    """C-arms around some patients, and where they find the tips of many worlds at once, of each with the same bits as
+    alone."""
 
-    def _likeliest(
+    def __init__(self, patients: Sequence[tuple[Anatomy, float]], config: FluoroscopeConfig) -> None:
+        """Lay out the lines of all patients, each a vessel and the radius of the wire in it, mm, in tables, a row a
+        patient; shorter rows end in vertices of no branch. `views` has those of each C-arm."""
+        made = [_lines(anatomy, radius_mm, config) for anatomy, radius_mm in patients]
+        self._config, self.views = config, [views for views, _ in made]
+        lengths = [[len(line) for line in lines[0]] for _, lines in made]
+        count = max(map(sum, lengths))
+
+        def table(rows: Iterable[Sequence[np.ndarray]], fill: float | int) -> np.ndarray:
+            joined = [np.concatenate(list(row)) for row in rows]
+            return np.stack([np.pad(a, [(0, count - len(a)), (0, 0)][: a.ndim], constant_values=fill) for a in joined])
+
+        fills = (0.0, 0.0, 1.0, np.inf)
+        self._points, self._tangents, self._sd, self._abscissa = (
+            table([lines[k] for _, lines in made], fill) for k, fill in enumerate(fills)
+        )
+        self._first = table([[np.repeat(np.cumsum(of) - of, of)] for of in lengths], count)
+        self._last = table([[np.repeat(np.cumsum(of) - 1, of)] for of in lengths], count)
+        self._window = np.arange(max(map(max, lengths)))
+        self._begins = np.diff(self._first, axis=1, prepend=-1) != 0
+        self._by_axis = np.moveaxis(self._points, -1, 0).copy()
+        shown = [
+            table([[views[k].project(line) for line in lines[0]] for views, lines in made], 0.0)
+            for k in range(len(self.views[0]))
+        ]
+        self._shown = np.moveaxis(np.stack(shown, axis=1), -1, 0).copy()
+        self._source, self._axes, self._scale = (
+            np.array([[getattr(view, name) for view in of] for of in self.views])
+            for name in ("source", "axes", "scale")
+        )
+
+    def find(
         self,
-        position: Float[np.ndarray, "3"],
-        direction: Float[np.ndarray, "3"],
-        inserted_length: float,
-        random: np.random.Generator,
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n"]]:
-        """Return where the tip may be, LPS mm, the likeliest place first, with covariances and weights.
+        arm: Int[np.ndarray, "n"],
+        tip: Float[np.ndarray, "n 3"],
+        heading: Float[np.ndarray, "n 3"],
+        inserted: Float[np.ndarray, "n"],
+        noise: Float[np.ndarray, "n views 2"],
+    ) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m"], Float[np.ndarray, "m 3 3"]]:
+        """Take an exposure of every view in some worlds and return where the tips may be, LPS mm, world by world and
+        the likeliest place of each first: numbers of the worlds, places, twice their negative log-likelihoods, and
+        inverses of their covariances.
 
         A view may show several parts of the vessel at one place: the likeliest place of every such part is returned.
+        `arm` is the number of each world's C-arm, `tip` where its tip truly is, `heading` along the wire there, and
+        `inserted` is Δ by the encoders, mm; `noise` is standard normal, along and across the wire: the error is larger
+        along it.
         """
-        detections = [self._detect(view, position, direction, random) for view in self._views]
-        length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
-        prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
-        magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
-        seen, first = list(zip(self._shown, detections, strict=True)), []
-        for branch, (sd, unlikely) in enumerate(zip(self._lateral_sd, prior, strict=True)):
-            squared = sum(((shown[branch] - one.pixel) ** 2).sum(axis=1) for shown, one in seen)
-            first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
-        least = min(float(cost.min()) for cost in first)
-        found = list[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]()
-        for branch, guess in enumerate(first):
-            fence = np.pad(guess, 1, constant_values=np.inf)
-            valleys = (guess <= least + _HOPELESS) & (guess < fence[:-2]) & (guess <= fence[2:])
-            for vertex in np.flatnonzero(valleys).tolist():
-                place, cost_there, nearest, covariance = self._refine(detections, branch, vertex)
-                found.append((cost_there + float(prior[branch][nearest]), place, covariance))
-        cost, places, covariances = (
-            np.array(each) for each in zip(*sorted(found, key=lambda each: each[0]), strict=True)
-        )
-        # The likelihood of a place is that of its best point by the volume of its errors.
-        return places, covariances, np.exp(0.5 * (cost[0] - cost)) * np.sqrt(np.linalg.det(covariances))
+        config = self._config
+        pixel, slope = self._seen(arm, tip)
+        along = (slope @ heading[:, None, :, None])[..., 0]
+        along = along / np.maximum(np.sqrt(_dot(along, along)), 1e-9)[..., None]
+        axes = np.stack([along, along[..., ::-1] * [-1.0, 1.0]], axis=-2)
+        sd = np.array([config.along_sd, config.pixel_sd])
+        pixel, whiten = pixel + ((noise * sd)[..., None, :] @ axes)[..., 0, :], axes / sd[:, None]
+        length_sd = 2.0 + _NEAR_SHARE * np.maximum(inserted, 0.0)
+        prior = ((self._abscissa[arm] - inserted[:, None]) / length_sd[:, None]) ** 2
+        magnified = self._scale[arm, :1] / config.geometry.source_to_isocenter_mm
+        right, up = ((self._shown[k][arm] - pixel[..., k, None]) ** 2 for k in range(2))
+        squared = (right + up).sum(axis=1)
+        cost = squared / (config.along_sd**2 + (magnified * self._sd[arm]) ** 2) + prior
+        before = np.where(self._begins[arm], np.inf, np.roll(cost, 1, axis=1))
+        after = np.where(np.roll(self._begins[arm], -1, axis=1), np.inf, np.roll(cost, -1, axis=1))
+        likely = cost <= cost.min(axis=1, keepdims=True) + _HOPELESS
+        row, vertex = np.nonzero(likely & (cost < before) & (cost <= after))
+        place, refined, nearest, information = self._refined(arm[row], vertex, pixel[row], whiten[row])
+        found = refined + prior[row, nearest]
+        order = np.lexsort((found, row))
+        return row[order], place[order], found[order], information[order]
 
-    def _refine(
-        self, detections: list[_Detection], branch: int, nearest: int
-    ) -> tuple[Float[np.ndarray, "3"], float, int, Float[np.ndarray, "3 3"]]:
-        """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, vertex and covariance.
+    def _seen(
+        self, arm: Int[np.ndarray, "n"], point: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n views 2"], Float[np.ndarray, "n views 2 3"]]:
+        """Return the pixels of points, and their derivatives by the points, as `View.project` and `View.slope` do."""
+        axes, scale = self._axes[arm], self._scale[arm]
+        off = point[:, None] - self._source[arm]
+        in_view = (off[..., None, :] @ axes.swapaxes(-1, -2))[..., 0, :]
+        away = in_view[..., :2, None] / in_view[..., 2:, None]
+        slope = (scale / in_view[..., 2])[..., None, None] * (axes[..., :2, :] - away * axes[..., 2:, :])
+        return scale[..., None] * in_view[..., :2] / in_view[..., 2:], slope
+
+    def _refined(
+        self,
+        arm: Int[np.ndarray, "n"],
+        nearest: Int[np.ndarray, "n"],
+        pixel: Float[np.ndarray, "n views 2"],
+        whiten: Float[np.ndarray, "n views 2 2"],
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3 3"]]:
+        """Return the likeliest places near vertices, twice their negative log-likelihoods, the vertices nearest to them
+        and the inverses of their covariances.
 
         Gauss-Newton on the errors of the pixels, in units of the detection's error, and on the distance from the line,
         in units of what is usual in that lumen.
         """
-        points, tangent, sd = self._points[branch], self._tangents[branch], self._lateral_sd[branch]
-        place, cost, jacobian = points[nearest], np.inf, np.eye(3)
+        first, last, nearest = self._first[arm, nearest], self._last[arm, nearest], nearest.copy()
+        place, cost, going = self._points[arm, nearest], np.zeros(len(arm)), np.arange(len(arm))
+        information = np.zeros((len(arm), 3, 3))
         for _ in range(_ITERATIONS):
-            across = (np.eye(3) - np.outer(tangent[nearest], tangent[nearest])) / sd[nearest]
-            rows, residuals = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
-            for one in detections:
-                rows.append(one.whiten @ one.view.slope(place))
-                residuals.append(one.whiten @ (one.view.project(place) - one.pixel))
-            jacobian, residual = np.concatenate(rows), np.concatenate(residuals)
-            cost = float(residual @ residual)
-            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-            place = place - step
-            nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
-            if step @ step < _NEAR_ENOUGH_MM**2:
+            own, at, here = arm[going], nearest[going], place[going]
+            tangent = self._tangents[own, at]
+            across = (np.eye(3) - tangent[:, :, None] * tangent[:, None]) / self._sd[own, at][:, None, None]
+            seen, slope = self._seen(own, here)
+            small = np.broadcast_to(1e-3 * np.eye(3), across.shape)
+            rows = np.concatenate([across, small, (whiten[going] @ slope).reshape(len(own), -1, 3)], axis=1)
+            off = (across @ (here - self._points[own, at])[..., None])[..., 0]
+            missed = (whiten[going] @ (seen - pixel[going])[..., None]).reshape(len(own), -1)
+            residual = np.concatenate([off, np.zeros_like(off), missed], axis=1)
+            cost[going], turned = _dot(residual, residual), rows.transpose(0, 2, 1)
+            information[going] = normal = turned @ rows
+            step = np.linalg.solve(normal, turned @ residual[..., None])[..., 0]
+            place[going] = here = here - step
+            window = np.minimum(first[going, None] + self._window, last[going, None])
+            x, y, z = (axis[own[:, None], window] - here[:, k, None] for k, axis in enumerate(self._by_axis))
+            nearest[going] = first[going] + (x**2 + y**2 + z**2).argmin(axis=1)
+            going = going[_dot(step, step) >= _NEAR_ENOUGH_MM**2]
+            if not len(going):
                 break
-        if len(detections) == 1:  # the depth is the vessel's, and ends at its wall
-            lateral = place - points[nearest]
-            lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
-            beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
-            place = place - max(beyond, 0.0) * lateral
-        return place, cost, nearest, np.linalg.inv(jacobian.T @ jacobian)
+        if pixel.shape[1] == 1:  # the depth is the vessel's, and ends at its wall
+            tangent, lateral = self._tangents[arm, nearest], place - self._points[arm, nearest]
+            lateral = lateral - _dot(lateral, tangent)[:, None] * tangent
+            width = np.maximum(np.sqrt(_dot(lateral, lateral)), 1e-9)
+            place = place - np.maximum(1 - np.sqrt(2) * self._sd[arm, nearest] / width, 0.0)[:, None] * lateral
+        return place, cost, nearest, information
+
+
+def _lines(
+    anatomy: Anatomy, wire_radius_mm: float, config: FluoroscopeConfig
+) -> tuple[list[View], tuple[list[np.ndarray], ...]]:
+    """Return the views of a C-arm, the middle of the vessel in its isocenter, and of the guiding catheter and of each
+    branch the points, tangents, usual distances of a tip from them, mm, and abscissae."""
+    lines, insertion = [branch.centerline for branch in anatomy.tree.branches], anatomy.insertion
+    behind = np.linspace(-_CATHETER_MM, -0.5, 40)
+    points = [line.points for line in lines]
+    catheter = insertion.position + behind[:, None] * insertion.direction
+    isocenter = np.concatenate(points).mean(axis=0)
+    views = [view_at(angles, isocenter, config.geometry) for angles in config.view_angles_deg[: 1 + config.biplane]]
+    radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
+    # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
+    wider = _UNCLAMPED if len(views) > 1 else 1.0
+    usual = [wider * np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
+    along = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
+    return views, ([catheter, *points], along, usual, [behind, *(line.abscissa for line in lines)])
+
+
+def _dot(a: Float[np.ndarray, "*n k"], b: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n"]:
+    return (a[..., None, :] @ b[..., None])[..., 0, 0]
 
 
 def make_c_arm(

@@ -26,7 +26,6 @@ from endopilot.imaging.aortic_root import (
     openings,
     opens_into,
 )
-from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.coronary_doubts import FoundTree, Scan, coronary_doubts
 from endopilot.imaging.grid import (
     LEAST_BLOOD_HU,
@@ -36,7 +35,7 @@ from endopilot.imaging.grid import (
     resample,
 )
 from endopilot.imaging.segment import SegmentConfig
-from endopilot.imaging.vessel_tracking import track_tree, vesselness
+from endopilot.imaging.vessel_tracking import lumen_at_half_height, track_tree, vesselness
 from endopilot.imaging.voxels import dilated
 from endopilot.lines import length_along
 from endopilot.progress import progress

@@ -15,14 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.geometry import farthest_apart_mm
 from endopilot.imaging.grid import mask_like
 from endopilot.imaging.segment import SegmentationMethod, SegmentConfig
-from endopilot.imaging.volume import SUFFIXES, read_volume, write_volume
+from endopilot.imaging.volume import SUFFIXES, read_mask, write_volume
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -120,17 +119,20 @@ def segment_by_program(
             written = ", ".join(sorted(path.name for path in target.rglob("*") if path.is_file())[:10]) or "nothing"
             raise InputError(f"{program} wrote no {answer} (it wrote {written}); {mend}")
         try:
-            found = read_volume(file)
+            found = read_mask(file, label=label)
         except InputError as error:
-            raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
-    inside = _labelled(found, label, program)
-    size = volume.voxels.shape[::-1]
-    if inside.shape != volume.voxels.shape or farthest_apart_mm(found, volume, size) > volume.spacing_mm.min() / 2:
-        inside = mask_like(LumenMask(replace(found, voxels=inside)), volume)
+            reason = str(error).removeprefix(f"{file}: ")
+            raise InputError(
+                f"{program} wrote a {answer} that is not taken: {reason}; give --options label=NUMBER where there are "
+                f"several, or {mend}"
+            ) from error
+    inside = found.volume.voxels
+    if inside.shape != volume.voxels.shape or farthest_apart_mm(found.volume, volume) > volume.spacing_mm.min() / 2:
+        inside = mask_like(found, volume)
         if not inside.any():
             raise InputError(f"{program} wrote a mask that lies outside the CT; {mend}")
     on_ct = replace(volume, voxels=inside)
-    return LumenMask(on_ct, _ostium_at_seeds(on_ct, seeds) if seeds else None, warnings=found.notes)
+    return LumenMask(on_ct, _ostium_at_seeds(on_ct, seeds) if seeds else None, warnings=found.warnings)
 
 
 def _ostium_at_seeds(lumen: Volume, seeds: Sequence[tuple[float, float, float]]) -> Insertion:
@@ -162,18 +164,6 @@ def _run(command: Sequence[str], mend: str) -> None:
         lines = [line.strip() for line in (answer.stderr + "\n" + answer.stdout).splitlines() if line.strip()]
         said = [line for line in lines if "error" in line.lower()] or lines or ["nothing"]
         raise InputError(f"{program} failed with exit code {answer.returncode}: {said[-1][:_LONGEST_MESSAGE]}; {mend}")
-
-
-def _labelled(found: Volume, label: int | None, program: str) -> Bool[np.ndarray, "nz ny nx"]:
-    labels = np.unique(found.voxels[found.voxels > 0]).astype(int)
-    if len(labels) == 0:
-        raise InputError(f"{program} found no lumen in this CT; try another method, or seeds with --method coronary")
-    listed = ", ".join(map(str, labels[:20]))
-    if label is None and len(labels) > 1:
-        raise InputError(f"{program} marked {len(labels)} labels ({listed}); choose one with --options label=NUMBER")
-    if label is not None and label not in labels:
-        raise InputError(f"{program} marked {listed}, and no voxel with label {label}; choose with --options label=")
-    return found.voxels == (labels[0] if label is None else label)
 
 
 TOTALSEGMENTATOR = SegmentationMethod(segment_lumen=by_totalsegmentator, options=_TOTALSEGMENTATOR)
