@@ -23,6 +23,7 @@ if __name__ == "__main__":
         port = str(free.getsockname()[1])
     words = [sys.executable, "-m", "endopilot.cli", "cockpit", sys.argv[1], "--replay", sys.argv[2], "--no-browser"]
     with subprocess.Popen([*words, "--igtl", port], stdout=subprocess.PIPE, encoding="utf-8") as cockpit:
+        python = environment("slicer", ("slicer-core",), Path("runs/judges").resolve())
         next(line for line in cockpit.stdout or () if line.startswith("page"))
-        subprocess.run([environment("slicer", ("slicer-core",), Path("runs/judges").resolve()), VIEW, port, IMAGE], check=True)
+        subprocess.run([python, VIEW, port, IMAGE], check=True)
         cockpit.terminate()

@@ -49,7 +49,7 @@ COMMANDS = {
     "verify": "the rod core compared with closed forms",
     "devices": "the known guidewires and their properties",
     "sample": "download a real CT angiogram to try",
-    "completion": "a script with which bash and zsh complete commands and options",
+    "completion": "a script with which bash, zsh and fish complete commands and options",
     "info": "versions and machine",
 }
 """Name of each command: what it takes -> what it makes."""
