@@ -35,8 +35,8 @@ def polydata(body: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     sizes = struct.unpack(">10I", body[:40])
     ends = np.cumsum([40, 12 * sizes[0], sizes[2], sizes[4], sizes[6]])
     points, _, lines, polygons = (body[a:b] for a, b in itertools.pairwise(ends))
-    places = np.frombuffer(points, ">f4").reshape(-1, 3).astype(float)
-    return places, *(np.frombuffer(cells, ">u4").astype(np.int64) for cells in (lines, polygons))
+    cells, corners = (np.frombuffer(each, ">u4").astype(np.int64) for each in (lines, polygons))
+    return np.frombuffer(points, ">f4").reshape(-1, 3).astype(float), cells, corners
 
 
 def length_mm(body: bytes) -> float:
