@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from PIL import Image
+
 sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
 
 from benchmarks.judges.environment import environment
@@ -27,3 +29,5 @@ if __name__ == "__main__":
         next(line for line in cockpit.stdout or () if line.startswith("page"))
         subprocess.run([python, VIEW, port, IMAGE], check=True)
         cockpit.terminate()
+    with Image.open(IMAGE) as picture:
+        picture.convert("RGB").quantize(256).save(IMAGE, optimize=True)
