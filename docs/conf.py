@@ -11,7 +11,7 @@ from endopilot import __version__
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads slow each other down on a busy machine
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "examples")]  # `benchmarks`, and for the processes that tutorial 4 starts
+sys.path.insert(0, str(ROOT))  # `benchmarks`
 
 project = "endopilot"
 author = "the endopilot authors"

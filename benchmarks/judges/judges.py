@@ -22,10 +22,14 @@ from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.cockpit.film import open_film
+from endopilot.cockpit.slicer import EVERY, write_film
+from endopilot.devices.device import read_wire
 from endopilot.imaging.volume import write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
-from endopilot.types import VesselTree, Volume
+from endopilot.simulation.simulate import simulate
+from endopilot.types import Anatomy, VesselTree, Volume
 from endopilot.vessels.surface import Surface, surface_from_mask
 from endopilot.xray.absorbers import WATER_MM
 from endopilot.xray.carm import CArmGeometry, view_at
@@ -182,6 +186,7 @@ def beside_slicer(environments: Path) -> list[dict[str, Any]]:
         written = {"patient/centerline.vtp": (lines, np.zeros(0)), "patient/lumen.nrrd": _corners(volume)}
         written |= {"ct.nrrd": _corners(ct), "ct.nii.gz": _corners(ct)}
         written |= {"mask.nrrd": _corners(mask), "mask.nii.gz": _corners(mask)}
+        written |= _replayed(anatomy, folder)
         asked, answer = folder / "files.json", folder / "nodes.json"
         asked.write_text(json.dumps([str(folder / file) for file in written]), encoding="utf-8")
         program = [str(python), str(Path(__file__).with_name("slicer_nodes.py")), str(asked), str(answer)]
@@ -196,6 +201,22 @@ def beside_slicer(environments: Path) -> list[dict[str, Any]]:
         }
         for (file, (points, values)), node in zip(written.items(), shown, strict=True)
     ]
+
+
+def _replayed(anatomy: Anatomy, folder: Path) -> dict[str, Lines]:
+    """Write the motion of a wire, and its path at the end; return points and values (times, forces) of both files."""
+    pushed = np.tile((8.0, 1.0), (1, 16, 1, 1))
+    simulate(anatomy, read_wire("workhorse-014"), pushed, period_s=0.5).write(folder / "pushed.npz")
+    film = open_film(folder / "pushed.npz", folder / "patient")
+    for name in ("replay.seq.mrb", "path.vtp"):
+        write_film(film, folder / name)
+    shown = [frame.snapshot for frame in film.make()]
+    at = shown[::EVERY]
+    values = [np.array([each.time_s for each in at]), *(each.node_force for each in at)]
+    return {
+        "replay.seq.mrb": (np.concatenate([each.nodes for each in at]), np.concatenate(values)),
+        "path.vtp": (shown[-1].nodes, shown[-1].node_force),
+    }
 
 
 def _corners(volume: Volume) -> Lines:

@@ -15,10 +15,9 @@ check.
 # asked for X-ray, the measured tip. It answers with a :class:`endopilot.Decision`: of each device a
 # translation in mm/s and a rotation in rad/s, and whether X-ray is to be on at the next decision.
 #
-# ``examples/my_policy.py`` holds one. It pushes and looks once a second. After a wrong branch it pulls back to before
-# the fork, turns the wire by 120°, and pushes again.
+# This one pushes and looks once a second. After a wrong branch it pulls back to before the fork, turns the wire by
+# 120°, and pushes again. It lies in a file of its own, so that the ladder's processes find it too.
 
-import inspect
 import sys
 import tempfile
 from pathlib import Path
@@ -27,10 +26,33 @@ import matplotlib.pyplot as plt
 
 import endopilot
 
-sys.path.insert(0, str(Path("../../examples").resolve()))  # `endopilot ladder` also looks where it is called
-from my_policy import TurnBack
+CODE = """
+import math
+import endopilot
 
-print(inspect.getsource(TurnBack))
+class TurnBack:
+    def start(self, navigation, seed):
+        # where each branch leaves the route to the target, mm from the ostium; infinite on the route itself
+        self.fork_mm = navigation.anatomy.tree.departures(navigation.target.branch)
+        self.pull_to_mm = self.turn_to_rad = None
+
+    def decide(self, observation):
+        tip, (inserted_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
+        if tip is not None and math.isfinite(self.fork_mm[tip.branch]):  # in a wrong branch: so much has to come out
+            self.pull_to_mm = max(inserted_mm - (tip.abscissa - self.fork_mm[tip.branch]) - 4.0, 0.0)
+            self.turn_to_rad = rotation_rad + 2 * math.pi / 3
+        if self.pull_to_mm is not None and inserted_mm > self.pull_to_mm:
+            return endopilot.Decision(((-5.0, 0.0),))
+        self.pull_to_mm = None
+        if self.turn_to_rad is not None and rotation_rad < self.turn_to_rad - 0.1:
+            return endopilot.Decision(((0.0, min(3.0, 2 * (self.turn_to_rad - rotation_rad))),))
+        self.turn_to_rad = None
+        return endopilot.Decision(((5.0, 0.0),), expose=observation.time_s % 1.0 == 0.5)
+"""
+folder = Path(tempfile.mkdtemp())
+(folder / "my_policy.py").write_text(CODE, encoding="utf-8")
+sys.path.insert(0, str(folder))  # `endopilot ladder` also looks where it is called
+from my_policy import TurnBack
 
 # %%
 # One navigation
@@ -70,7 +92,6 @@ plt.show()
 # patients take some minutes. Several processes drive the navigations: in a script of your own, make the call under
 # ``if __name__ == "__main__":``.
 
-folder = Path(tempfile.mkdtemp())
 safe_success = {}
 for policy in ("forward", "my_policy:TurnBack"):
     config = endopilot.LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)

@@ -1,4 +1,4 @@
-"""What Tab completes, by bash itself with the script that `endopilot completion` prints."""
+"""What Tab completes, by bash and fish themselves with the script that `endopilot completion` prints."""
 
 import shutil
 import subprocess
@@ -17,6 +17,13 @@ def script(tmp_path_factory):
     file = tmp_path_factory.mktemp("completion") / "script"
     file.write_text(made)
     return file
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
+def test_tab_completes_in_fish():
+    ask = f"{sys.executable} -m endopilot.cli completion fish | source; complete -C 'endopilot xray --show '"
+    made = subprocess.run(["fish", "--no-config", "-c", ask], capture_output=True, text=True, check=True)
+    assert made.stdout.split() == ["contrast", "dsa", "fluoroscopy", "roadmap"]
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")

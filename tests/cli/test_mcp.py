@@ -12,6 +12,7 @@ pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
 from mcp import Client, StdioServerParameters, stdio_client
 
 from endopilot.cli.mcp import server
+from endopilot.errors import InputError
 
 
 def asked(folder, *calls, over=None):
@@ -78,3 +79,8 @@ def test_bad_input_is_answered_in_a_line_and_writes_nothing(folder, name, given,
     assert result.is_error and said in result.content[0].text
     assert str(folder) not in result.content[0].text
     assert sorted(folder.parent.rglob("*")) == before
+
+
+def test_a_file_is_no_folder_to_serve(folder) -> None:
+    with pytest.raises(InputError, match=r"anatomy.json: is no folder; give the one whose files"):
+        server(folder / "patient" / "anatomy.json")

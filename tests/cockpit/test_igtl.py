@@ -25,6 +25,12 @@ def streamed(session):
     stage.close()
 
 
+def test_time_passes_while_slicer_looks(streamed):
+    assert not streamed.watched()
+    with socket.create_connection(("127.0.0.1", streamed.port), timeout=10):
+        assert streamed.watched()
+
+
 def read(stage, names=frozenset({"Vessel", "Centerlines", "Wire", "Tip", "Target"})):
     """Connect, let a cycle pass, and return the bodies of the messages that come, and what the page is shown."""
     bodies = {}

@@ -49,7 +49,7 @@ COMMANDS = {
     "verify": "the rod core compared with closed forms",
     "devices": "the known guidewires and their properties",
     "sample": "download a real CT angiogram to try",
-    "completion": "a script with which bash and zsh complete commands and options",
+    "completion": "a script with which bash, zsh and fish complete commands and options",
     "info": "versions and machine",
 }
 """Name of each command: what it takes -> what it makes."""
@@ -112,15 +112,20 @@ def command_of(name: str) -> Command:
 
 def overview() -> str:
     """Return the text of `endopilot --help`."""
+    import textwrap
+
     headings = {name: f"\n{group}\n" for name, group in GROUPS.items()}
-    commands = "\n".join(f"{headings.get(name, '')}  {name:<12} {summary}" for name, summary in COMMANDS.items())
+    lines = {name: textwrap.fill(f"  {name:<12} {of}", 80, subsequent_indent=" " * 15) for name, of in COMMANDS.items()}
+    commands = "\n".join(f"{headings.get(name, '')}{line}" for name, line in lines.items())
     return f"""usage: endopilot COMMAND ...
 
-From a CT angiogram to an agent that drives an endovascular guidewire. For research; no medical device.
+From a CT angiogram to an agent that drives an endovascular guidewire.
+For research; no medical device.
 Units are mm, N, s, rad and HU; world coordinates are LPS mm.
 {commands}
 
-`endopilot COMMAND --help` lists what is set most often, with units and defaults; `--help-all` lists all."""
+`endopilot COMMAND --help` lists what is set most often, with units and
+defaults; `--help-all` lists all."""
 
 
 def _work(name: str, arguments: Sequence[str]) -> None:

@@ -24,7 +24,7 @@ def verify_command() -> Answer:
     independent engine, and `python -m benchmarks --help` lists what else is measured.
     """
     rows = [case.row() for case in run(free_rod.CASES)]
-    more = "more: `python -m benchmarks verification` in the source tree (drives, walls, catheters, MuJoCo)"
+    more = "more: `python -m benchmarks verification` in the source tree"
     return Answer(rows, [rows, more], passed=all(row["passed"] is not False for row in rows))
 
 

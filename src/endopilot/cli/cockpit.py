@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import Existing, ListenConfig
+from endopilot.cli.arguments import IS_FILE, Existing, ListenConfig
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
@@ -26,6 +26,7 @@ def cockpit_command(
     world: CountOrZero = 0,
     replay: Existing | None = None,
     episode: Path | None = None,
+    film: Annotated[Path, IS_FILE] | None = None,
     resume: Existing | None = None,
     ct: Existing | None = None,
     igtl: Annotated[int, Within(0, 65535)] | None = None,
@@ -46,6 +47,8 @@ def cockpit_command(
             instead.
         episode: with --replay SESSION: write the session into this folder as a data set of one episode to train on, and
             leave.
+        film: with --replay: write the lines of the devices into this file for 3D Slicer, their motion (.seq.mrb) or
+            their path at the end (.vtp), and leave.
         resume: go on with the session in this file, which a killed server left.
         ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
         igtl: TCP port of this machine at which 3D Slicer (OpenIGTLink) gets wire, tip, target and vessel, 18944 as a
@@ -56,6 +59,15 @@ def cockpit_command(
     """
     if episode is not None:
         _write_episode(replay, episode)
+        return
+    if film is not None:
+        from endopilot.cockpit.film import open_film
+        from endopilot.cockpit.slicer import write_film
+
+        if replay is None:
+            raise InputError("film: nothing is replayed; give --replay too")
+        write_film(open_film(replay, patient, world=world, task=task), film)
+        print(f"film       {film}")
         return
     require_extras("cockpit")
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session

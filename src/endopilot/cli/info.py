@@ -12,4 +12,8 @@ def info_command() -> Figures:
     """Print versions, machine, the level of the rod core for this processor, and which extras are installed."""
     facts = manifest(config=None)
     figures = {"commit": facts["commit"], **facts["versions"], **facts["machine"], "core": _core.LEVEL}
-    return figures | {"extras": extras_present()}
+    there = extras_present()
+    return figures | {
+        name: " ".join(e for e in there if there[e] is is_there) or "-"
+        for name, is_there in (("extras", True), ("missing", False))
+    }

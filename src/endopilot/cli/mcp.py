@@ -77,7 +77,9 @@ def mcp_command(folder: Positional[Existing], /) -> None:
 
 
 def server(folder: Path) -> Any:
-    """Return the SDK's server with the tools, for `run` or for a client in this process."""
+    """Return the SDK's server with the tools, for `run` or for a client in this process; InputError for no folder."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the one whose files the tools may read and write")
     from mcp.server import MCPServer  # pyright: ignore[reportMissingImports]
 
     made = MCPServer("endopilot", version=__version__, instructions=_ABOUT)

@@ -54,16 +54,20 @@ class Streamed:
         sent = self._stage.cycle(now_s)
         if now_s >= self._next_s:
             self._next_s = now_s + FRAME_S
-            with contextlib.suppress(BlockingIOError):
-                peer, _ = self._listener.accept()
-                peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-                peer.settimeout(FRAME_S)
-                self._peers.append(peer)
-                self._send([peer], _vessel(self._scene()))
             state = dict(sent).get("state")
-            if self._peers and state is not None:
+            if self.watched() and state is not None:
                 self._send(self._peers, _devices(state))
         return sent
+
+    def watched(self) -> bool:
+        """Let who asks connect, and return whether somebody is, so that time passes without a page."""
+        with contextlib.suppress(BlockingIOError):
+            peer, _ = self._listener.accept()
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+            peer.settimeout(FRAME_S)
+            self._peers.append(peer)
+            self._send([peer], _vessel(self._scene()))
+        return bool(self._peers)
 
     def close(self) -> None:
         """End the stage, and hang up."""

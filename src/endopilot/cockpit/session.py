@@ -327,7 +327,7 @@ class Loop:
     def _cycles(self) -> None:
         due = time.perf_counter()
         while not self._over.is_set():
-            if not self._wanted.is_set():
+            if not (self._wanted.is_set() or getattr(self._stage, "watched", bool)()):
                 self._read(time.perf_counter())
                 if not self._wanted.wait(timeout=0.05):
                     continue

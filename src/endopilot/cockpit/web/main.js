@@ -5,10 +5,9 @@ import { Fluoroscopy, list, put } from "./fluoroscopy.js";
 import { GameBar } from "./game.js";
 import { Hands } from "./hands.js";
 import { ReplayBar } from "./replay.js";
-import { Sound } from "./sound.js";
 import { Space } from "./space.js";
 
-const page = { state: null, role: { drives: false }, space: null, frames: 0, ticks: 0, counted: 0, written: 0 };
+const page = { state: null, role: { drives: false }, space: null, frames: 0, written: 0 };
 const TEXT_MS = 90; // between two updates of the page's text
 window.cockpit = page; // for tests and the console
 
@@ -56,7 +55,6 @@ function showForce(state) {
   document.querySelector("#force u").style.left = "80%";
   put("force-label", blind ? "Drive's load" : "Wall force");
   put("force-text", `${value.toFixed(3)} N`);
-  page.sound.set(share);
 }
 
 /** The wire, and the catheters around it from the inside out. */
@@ -107,7 +105,6 @@ function showText(state) {
 
 function frame(now) {
   requestAnimationFrame(frame);
-  page.ticks += 1;
   const fresh = page.state && page.state !== page.shown;
   if (fresh) {
     page.shown = page.state;
@@ -121,11 +118,6 @@ function frame(now) {
   if (page.shown?.sight !== false) page.frames += page.space.draw(now);
 }
 
-function countFrames() {
-  put("frames", `${page.ticks - page.counted} frames/s`);
-  page.counted = page.ticks;
-}
-
 async function start() {
   try {
     page.scene = await fetchScene();
@@ -135,7 +127,6 @@ async function start() {
   }
   put("patient", [page.scene.name, page.scene.wire, ...devices().slice(1).map((one) => `in ${one.name}`)].join(", "));
   put("scale-text", `wall force, 0 to ${page.scene.force_limit_n} N`);
-  page.sound = new Sound(document.getElementById("sound"));
   page.connection = new Connection(handlers, (why) => { if (!page.fatal) banner(why); });
   page.xray = new Fluoroscopy(page.connection);
   page.space = new Space(document.getElementById("scene"), page.scene, (place) => page.connection.send("target", place));
@@ -144,7 +135,6 @@ async function start() {
   page.replay = new ReplayBar(page.connection);
   if (page.scene.policies) page.autopilot = new AutopilotBar(page.connection, page.scene);
   page.hands = new Hands(page.connection, devices(), () => page.role.drives, () => Boolean(page.autopilot?.drives), () => page.space.wake());
-  setInterval(countFrames, 1000);
   requestAnimationFrame(frame);
 }
 
