@@ -132,7 +132,8 @@ def test_no_cut_of_a_loop_takes_vessel_away():
 def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
     pieces = [(line((20.0 * i, 0, 0), (20.0 * i, 0, 60 - 15 * i)), 1.5) for i in range(3)]
     anatomy = extract_anatomy(lumen(tubes(*pieces)), name="pieces")
-    left = [note for note in anatomy.provenance["notes"] if "apart from the lumen, which --ostium-mm chooses, left out" in note]
+    told = "apart from the lumen, which --ostium-mm chooses, left out"
+    left = [note for note in anatomy.provenance["notes"] if told in note]
     assert len(left) == 2 and "at (19.0, " in left[0] and "at (39.0, " in left[1]
     config = AnatomyConfig(ostium_mm=(0.0, 0.0, 30.0))
     assert "of the lumen behind the ostium" in notes_of(extract_anatomy(lumen(tubes(*pieces[:1])), config=config))
