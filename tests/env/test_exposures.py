@@ -70,7 +70,7 @@ def test_the_tips_of_all_worlds_are_found_where_a_fluoroscope_finds_each(ahead, 
     depths, noise = random.uniform(0, 60, 60), []
     alone = np.empty((60, 3))
     for k, of in enumerate(arm):
-        alone[k] = arms[of].locate(tips[k], headings[k], depths[k], np.random.default_rng(k))
+        alone[k] = arms[of].measure(tips[k], headings[k], depths[k], np.random.default_rng(k)).position
         noise.append(np.random.default_rng(k).standard_normal((1 + biplane, 2)))
     finder, some = TipFinder(arms, arm), np.arange(0, 60, 7)
     np.testing.assert_allclose(finder.locate(np.arange(60), tips, headings, depths, np.array(noise)), alone, atol=1e-9)

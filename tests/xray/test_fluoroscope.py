@@ -18,7 +18,7 @@ def located(fork, config: FluoroscopeConfig, count: int = 120) -> tuple[np.ndarr
     height, turn = random.uniform(5, 15, count), random.uniform(0, 2 * np.pi, count)
     true = np.stack([0.7 * np.cos(turn), 0.7 * np.sin(turn), height], axis=1)
     along = np.array([0.0, 0.0, 1.0])
-    return true, along, np.array([arm.locate(place, along, place[2], random) for place in true])
+    return true, along, np.array([arm.measure(place, along, place[2], random).position for place in true])
 
 
 def test_two_views_without_error_find_the_tip(fork) -> None:

@@ -252,16 +252,6 @@ class Fluoroscope:
         found = np.linalg.solve(information, insertion.direction / _LEAN_SD**2)
         return found / np.linalg.norm(found)
 
-    def locate(
-        self,
-        tip_position: Float[np.ndarray, "3"],
-        tip_direction: Float[np.ndarray, "3"],
-        inserted_length: float,
-        random: np.random.Generator,
-    ) -> Float[np.ndarray, "3"]:
-        """Return the position, LPS mm, that `measure` finds."""
-        return self._likeliest(tip_position, tip_direction, inserted_length, random)[0][0]
-
     def _detect(
         self,
         view: View,
