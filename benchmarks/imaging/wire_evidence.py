@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scenes
 from endopilot.files import write_json
 from endopilot.xray.absorbers import in_catheter, lumen_points
-from endopilot.xray.detector import PARAMETERS, RidgeEvidence, TipDetector, features, products
+from endopilot.xray.detector import PARAMETERS, TipDetector, features, products
 
 SCENES = SceneConfig(patients=8, seed=9001)
 IMAGES, OFF_WIRE, STEP_MM = 10, 600, 0.25
@@ -26,7 +26,7 @@ RIDGE = 1e-4
 
 def samples(scene: Scene, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the features of pixels on wires, and of pixels in the vessel off them."""
-    detector = TipDetector(scene.anatomy, scene.device, evidence=RidgeEvidence(np.zeros(1), 0.0))
+    detector = TipDetector(scene.anatomy, scene.device)
     places = lumen_points(scene.anatomy)[0]
     on, off = [], []
     for image in range(IMAGES):

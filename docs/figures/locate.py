@@ -61,7 +61,13 @@ def rows_of(anatomy: Anatomy, frames: tuple[DeviceFrame, ...], camera: Camera, a
         for part, of in (("0 to 36", found[:TRAINED]), ("37 to 73", found[TRAINED:])):
             rows.append(f"| {anatomy.name} | {name} | {part} | {judged(of, authors, seconds)} |")
         if landmark is not None:
-            draw_locations(anatomy, found, DOCS / "images" / "locate.png", frames=frames, cameras=[camera])
+            draw_locations(
+                anatomy,
+                found,
+                DOCS / "images" / "locate.png",
+                lines=[frame.lines[0] for frame in frames],
+                project=lambda index, points, found=found: camera.project(points + found[index].moved_mm),
+            )
     return rows
 
 

@@ -10,11 +10,12 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from endopilot.xray.carm import CArmGeometry, view_at
-from endopilot.xray.detector import CATHETER_MM, DetectorConfig, TipDetector
+from endopilot.xray.detector import CATHETER_MM, TipDetector
 from endopilot.xray.image import XrayImager
-from endopilot.xray.tip_posterior import Shifts, estimate_tip, possible_shifts
+from endopilot.xray.tip_posterior import Told, estimated
 from endopilot.xray.vessel_grid import make_grid, with_catheter
 from endopilot.xray.wire_end import fit_end
+from endopilot.xray.wire_likelihood import Shifts, end_log, possible_shifts, tell, way_to
 
 ANGLES = ((-30.0, 0.0), (60.0, 0.0))
 TIP = {0: 14.0, 1: 32.0, 2: 32.0}
@@ -46,7 +47,7 @@ def exposed(imager, planes, nodes, **how):
 def found_in(imager, planes, signals, length: float, shown=(0, 1), dose: float = 1.0):
     detector = TipDetector(imager.anatomy, imager.stack.wire)
     views, photons = [planes[i].view for i in shown], [imager.photons(planes[i], dose) for i in shown]
-    return detector.find(views, [signals[i] for i in shown], photons, length)
+    return detector.estimate(views, [signals[i] for i in shown], photons, length)
 
 
 @pytest.mark.parametrize("branch", TIP)
@@ -92,9 +93,9 @@ def test_without_a_wire_none_is_found(imager, planes, fork, contrast):
     """A branch filled with contrast is a dark line too."""
     signals = exposed(imager, planes, np.zeros((0, 3)), contrast=contrast)
     for shown in ((0,), (1,), (0, 1)):
-        assert found_in(imager, planes, signals, TIP[2], shown) is None
+        assert found_in(imager, planes, signals, TIP[2], shown).status == "not found"
     lit = exposed(imager, planes, wire_to(fork, 2), contrast=contrast)
-    assert found_in(imager, planes, lit, TIP[2]) is not None
+    assert found_in(imager, planes, lit, TIP[2]).status != "not found"
 
 
 def test_less_dose_is_less_sure(imager, planes, fork):
@@ -126,8 +127,10 @@ def test_the_end_of_a_line_is_found_to_a_part_of_a_pixel():
 def ends_in(fork, view, image, length):
     """Return what one image of evidence says of a wire's end in a vessel that lies where it is registered."""
     grid = with_catheter(make_grid(fork.tree, step_mm=0.5), fork, CATHETER_MM)
-    still = Shifts(np.zeros((1, 3)), np.zeros(1), np.zeros((3, 3)))
-    return estimate_tip(grid, grid.radius - 0.18 + 0.3, [view], [image], still, length)
+    still, room_mm = Shifts(np.zeros((1, 3)), np.zeros(1), np.zeros((3, 3))), grid.radius - 0.18 + 0.3
+    ends = end_log(grid.abscissa, length)
+    told, log_odds = tell(grid, room_mm, way_to(grid, room_mm, [view], [image], still.mm), still, ends)
+    return replace(estimated(grid, told, ends, 4.0), log_odds=log_odds)
 
 
 def test_evidence_and_encoder_both_count(fork, planes):
@@ -144,19 +147,11 @@ def test_evidence_and_encoder_both_count(fork, planes):
     assert ends_in(fork, view, uphill, 12.0).log_odds < -2.0
 
 
-@pytest.mark.parametrize("back_mm", [3.0, 8.0])
-def test_a_wire_that_folds_back_ends_behind_its_fold(imager, planes, fork, back_mm):
-    straight = wire_to(fork, 0)
-    turn = np.linspace(0, np.pi, 9)[1:-1, None]
-    bow = straight[0] + np.concatenate([0 * turn, 0.6 * (np.cos(turn) - 1), 0.6 * np.sin(turn)], axis=1)[::-1]
-    back = straight[0] + [0.0, -1.2, 0.0] - np.linspace(back_mm, 0, 17)[:, None] * [0.0, 0.0, 1.0]
-    nodes = np.concatenate([back, bow, straight])
-    for shown in ((0, 1), (1,)):
-        found = found_in(imager, planes, exposed(imager, planes, nodes), TIP[0] + 0.6 * np.pi + back_mm, shown)
-        error = max(
-            np.linalg.norm(planes[i].view.project(found.position) - planes[i].view.project(nodes[0])) for i in shown
-        )
-        assert error < 5.0  # pixels: half of what counts as missed, 1 mm
+def test_a_wire_that_may_have_folded_back_is_ambiguous(imager, planes, fork):
+    """It is seen to reach 14 mm: with 20 mm more inserted its tip is anywhere behind, with 1 mm more it is there."""
+    signals = exposed(imager, planes, wire_to(fork, 0))
+    there, folded = (found_in(imager, planes, signals, TIP[0] + more) for more in (1.0, 20.0))
+    assert there.status == "found" and folded.status == "ambiguous"
 
 
 def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork):
@@ -168,13 +163,12 @@ def test_lines_that_were_there_before_are_none_of_the_wire(imager, planes, fork)
     images = views, exposed(imager, among, nodes), photons, TIP[0]
     empty = [imager.signal(plane, np.zeros((0, 3)), seed=90 + index) for index, plane in enumerate(among)]
     detector = TipDetector(fork, imager.stack.wire)
-    assert np.linalg.norm(detector.find(*images, before=empty).position - nodes[0]) < 1.5
-    assert np.linalg.norm(detector.find(*images).position - nodes[0]) > 5.0
-    assert detector.find(views, empty, photons, TIP[0], before=empty) is None
-    # An exposure of a little dose would not show them; that one was made says nothing of the next.
-    detector = TipDetector(fork, imager.stack.wire)
-    detector.find(images[0], images[1], [0.0025 * count for count in photons], TIP[0], before=empty)
-    assert np.linalg.norm(detector.find(*images, before=empty).position - nodes[0]) < 1.5
+    lines = list(map(detector.lines, views, empty, photons))
+    assert np.linalg.norm(detector.estimate(*images, lines).position - nodes[0]) < 1.5
+    assert np.linalg.norm(detector.estimate(*images).position - nodes[0]) > 5.0
+    assert detector.estimate(views, empty, photons, TIP[0], lines).status == "not found"
+    dim = detector.lines(views[0], empty[0], 0.0025 * photons[0])  # a little dose would not show them
+    assert lines[0].sum() > 200 and dim.sum() < 0.2 * lines[0].sum()
 
 
 def test_a_straight_vessel_that_lies_off_along_itself_is_not_taken_for_sure(imager, planes, fork):
@@ -182,21 +176,21 @@ def test_a_straight_vessel_that_lies_off_along_itself_is_not_taken_for_sure(imag
     nodes = wire_to(fork, 0)
     views = [replace(plane.view, source=plane.view.source + np.array([0.0, 0.0, 2.5])) for plane in planes]
     photons = [imager.photons(plane) for plane in planes]
-    found = TipDetector(fork, imager.stack.wire).find(views, exposed(imager, planes, nodes), photons, TIP[0])
+    found = TipDetector(fork, imager.stack.wire).estimate(views, exposed(imager, planes, nodes), photons, TIP[0])
     error = found.position - nodes[0]
     assert found.status == "ambiguous" and np.linalg.norm(error[:2]) < 0.82  # of the room in the lumen
     assert error @ np.linalg.solve(found.covariance, error) < 2.795**2  # the region of 95 %
 
 
-def test_an_estimate_that_is_not_sure_is_ambiguous_and_its_region_holds_the_rest(imager, planes, fork):
-    images = [planes[0].view], exposed(imager, planes, wire_to(fork, 1))[:1], [imager.photons(planes[0])], TIP[1]
-    sure, strict = (
-        TipDetector(fork, imager.stack.wire, DetectorConfig(sure=share)).find(*images) for share in (0.5, 1 - 1e-12)
-    )
-    assert sure.status == "found" and strict.status == "ambiguous"
-    np.testing.assert_array_equal(sure.position, strict.position)
-    np.testing.assert_allclose(strict.covariance, sure.covariance + sure.elsewhere)
-    assert np.trace(sure.elsewhere) > 0
+def test_a_posterior_of_two_places_is_at_the_likelier_one_and_its_region_holds_both(fork):
+    """Σ of an ambiguous tip is that near its mode, and w·d·dᵀ of a place at d of weight w."""
+    grid = make_grid(fork.tree, step_mm=1.0)
+    places = np.array([5, 40])
+    told = Told(places, np.log([0.7, 0.3]), np.zeros((2, 6)), np.tile(np.diag([0.1] * 6), (2, 1, 1)))
+    found = replace(estimated(grid, told, np.zeros(2), 4.0), status="ambiguous")
+    far = grid.middle[40] - grid.middle[5]
+    assert found.share == pytest.approx(0.7) and found.mode == 5
+    np.testing.assert_allclose(found.covariance, (0.1 + 1 / 12) * np.eye(3) + 0.3 * np.outer(far, far))
 
 
 def test_what_one_view_leaves_open_of_a_shift_is_what_the_covariance_says() -> None:
@@ -223,10 +217,13 @@ def test_a_ridge_that_contrast_may_make_is_no_wire(imager, planes, fork, with_wi
         signal -= 0.0 if with_wire else 0.25 * np.minimum(4 * gaussian_filter(drawn, 1.5), 1)
     detector = TipDetector(fork, imager.stack.wire)
     views, photons = [plane.view for plane in planes], [imager.photons(plane, 1.0) for plane in planes]
-    alone, beside, unseen = (
-        detector.estimate(views, signals, photons, None, contrast=[np.full_like(one, dark) for one in signals])
-        for dark in (0.0, 0.12, np.inf)
-    )
+    anywhere = np.where(detector.grid.branch < 0, -np.inf, 0.0)
+    estimates = []
+    for dark in (0.0, 0.12, np.inf):
+        seen = detector.look(views, signals, photons, contrast=[np.full_like(one, dark) for one in signals])
+        told, log_odds = detector.tell(seen, anywhere)
+        estimates.append(detector.judge(seen, told, anywhere, log_odds))
+    alone, beside, unseen = estimates
     assert alone.status == "found" and unseen.status == "not found"
     if with_wire:
         assert np.linalg.norm(beside.position - nodes[0]) < 1.0

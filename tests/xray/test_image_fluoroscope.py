@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.imaging.xray import vessel_error_mm
+from benchmarks.imaging.xray import motion_error_mm, vessel_error_mm
 from endopilot.errors import InputError
-from endopilot.simulation.motion import Motion
+from endopilot.simulation.motion import Motion, draw_motion, motion_named, published_mean
 from endopilot.xray import image_fluoroscope
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
 
@@ -49,9 +49,9 @@ def test_exposures_show_a_vessel_that_lies_beside_where_it_is_registered(arm, fo
         shown = unsure.measure(nodes, 15.3, np.random.default_rng(index))
         errors.append(np.linalg.norm(shown.position - nodes[0]))
     room_mm = 1.0 - 0.18  # of the lumen and of the wire
-    assert np.linalg.norm(unsure.displaced.shift - [0.0, 2.5, 0.0]) < room_mm and errors[1] < room_mm
+    assert np.linalg.norm(unsure.shift - [0.0, 2.5, 0.0]) < room_mm and errors[1] < room_mm
     unsure.forget_wires()
-    assert not unsure.displaced.shift.any()
+    assert not unsure.shift.any()
 
 
 def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
@@ -67,7 +67,7 @@ def test_a_wire_is_found_where_the_known_motion_does_not_take_the_vessel(arm):
     # A straight vessel does not show how far it lies off along itself: the region says so.
     assert np.linalg.norm(error[:2]) < 0.82 and error @ np.linalg.solve(shown.covariance, error) < 4.0
     assert shown.covariance[1, 1] > 0.1  # how far it lies off is not quite known
-    assert not moving.displaced.shift.any()  # the patient lies where they lay
+    assert not moving.shift.any()  # the patient lies where they lay
 
 
 def test_an_image_without_a_wire_measures_nothing(arm):
@@ -80,3 +80,22 @@ def test_a_vessel_that_is_not_recognised_is_told(fork, wire, monkeypatch):
     )
     with pytest.raises(InputError, match=r"fork cannot be registered"):
         ImageFluoroscope(fork, wire)
+
+
+def test_a_run_of_contrast_shows_how_the_patient_moves(arm, fork):
+    motion = replace(draw_motion(2), heart_period_s=0.7)
+    mean = published_mean(motion)
+    found = arm.measure_motion(motion, np.random.default_rng(0))
+    assert found.heart_period_s == 0.7 and found.heart_rotation_deg == mean.heart_rotation_deg
+    without, left = (motion_error_mm(fork, motion, each) for each in (mean, found))
+    assert without > 0.4 and left < 0.2 and left < without / 3  # a vessel of 40 mm shows rotations roughly
+
+
+def test_what_lies_still_stays_still(arm, fork):
+    motion = replace(motion_named("breathing"), breathing_caudal_mm=7.5)
+    found = arm.measure_motion(motion, np.random.default_rng(0))
+    assert found.annulus_mm == found.heart_volume_share == 0
+    assert found.breathing_caudal_mm == pytest.approx(7.5, abs=0.3)
+    still = replace(motion_named("breathing"), breathing_caudal_mm=0.0, breathing_anterior_mm=0.0)
+    still = replace(still, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
+    assert arm.measure_motion(still, np.random.default_rng(0)) is None

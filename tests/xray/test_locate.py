@@ -131,19 +131,13 @@ def test_later_frames_tell_of_earlier_ones(anatomy) -> None:
     assert left < 0.6 * spread and after.mean() < before.mean() + 0.5
 
 
-def test_a_tip_in_the_wrong_branch_is_found_again(anatomy) -> None:
-    """The first frame is told a tip in another branch, with all certainty; the following ones show where it is."""
+def test_a_tip_that_is_suddenly_in_another_branch_is_found_again(anatomy) -> None:
+    """The tip travels 4 mm a frame in the mean, and in one frame of fifty is anywhere."""
     one, other = anatomy.tree.leaves()[:2]
-    devices, moved = course(anatomy, one)
-    frames = frames_of(devices[-1:] * 6, np.repeat(moved[-1:], 6, axis=0), CAMERAS[:1])
-    wrong = anatomy.tree.branches[other].centerline.points[-1]
-    told = LocateConfig(landmark_mm=tuple(wrong), landmark_px=tuple(CAMERAS[0].project(wrong[None] + moved[-1])[0]))
-    follow = TipFilter(anatomy.tree, CAMERAS[:1], told)
-    last = np.linalg.norm(follow.grid.middle - wrong, axis=1).argmin()
-    follow._log = np.full(len(follow.grid.middle), -500.0)
-    follow._log[last] = 0.0
-    found = [follow.update(frame.number, frame.lines) for frame in frames]
-    assert found[-1].branch == one and found[-1].status == "found"
+    shown = [course(anatomy, leaf)[0][-1] for leaf in (other, other, one, one, one)]
+    frames = frames_of(shown, np.zeros((5, 3)), CAMERAS[:1])
+    found = locate(anatomy, frames=frames, cameras=CAMERAS[:1])
+    assert found[0].branch == other and found[-1].branch == one and found[-1].status == "found"
 
 
 def test_what_is_no_device_is_not_found(anatomy) -> None:

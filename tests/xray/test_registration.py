@@ -51,11 +51,8 @@ def test_one_view_finds_what_it_sees(fork, exposures):
     assert error @ np.linalg.solve(found.covariance, error) < 16.8  # 99 % of normal errors in six numbers
 
 
-def test_an_image_without_contrast_is_told(fork, exposures):
-    views, _, before, again = exposures
+def test_what_does_not_fit_is_told(fork, exposures):
+    """An image without contrast, and a view that is not the given one."""
+    views, lit, before, again = exposures
     assert "inject contrast" in register(fork, views, again, before).failure
-
-
-def test_a_view_that_is_not_the_given_one_is_told(fork, exposures):
-    views, lit, before, _ = exposures
     assert register(fork, views[::-1], lit, before).failure

@@ -7,7 +7,6 @@ that is found bounds the pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,53 +19,20 @@ from endopilot.simulation.motion import Motion, published_mean
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
-from endopilot.xray.carm import Pose, View, view_at
-from endopilot.xray.detector import TipDetector
+from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.detector import DISPLACED_MM, TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
-from endopilot.xray.image import ImageConfig, Plane, XrayImager, isocenter_of
+from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.moving_patient import seen_wire
 from endopilot.xray.registration import Registration, register, register_motion, take_run
-from endopilot.xray.tip_posterior import TipEstimate
 
 _NO_WIRE = np.zeros((0, 3))
-_MOVES_MM = 2.0
-"""Standard deviation of the vessel's place along each axis in a patient who moves, mm: their motion is not quite the
-known one."""
-_DRIFTS_MM = 0.3
+DRIFTS_MM = 0.3
 """A vessel that lies shifted drifts by this from exposure to exposure, mm: an assumption."""
 
 
 class NotRegistered(InputError):
     """A vessel is not recognised in the X-ray images that were to register the patient."""
-
-
-class Displaced:
-    """Where a vessel lies from where it is registered, by all exposures so far.
-
-    Attributes:
-        shift: LPS mm of the CT, the likeliest.
-        covariance: mm².
-    """
-
-    def __init__(self, anatomy: Anatomy, registration: Registration, sd_mm: float) -> None:
-        """Begin with what registration leaves open, and how far a vessel may lie off besides, mm along each axis."""
-        points, pose = anatomy.tree.line.points[::8], registration.pose
-        isocenter = isocenter_of(anatomy)
-        steps = np.linalg.cholesky(registration.covariance).T
-        moved = [Pose.of_vector(pose.vector + step).move(points, isocenter) for step in steps]
-        off = np.array(moved) - pose.move(points, isocenter)
-        self.shift = np.zeros(3)
-        self.covariance = np.einsum("kni,knj->ij", off, off) / len(points) + sd_mm**2 * np.eye(3)
-
-    def views(self, views: Sequence[View]) -> list[View]:
-        """Return views, in the CT's frame as it is registered, in that of the vessel as it lies."""
-        return [replace(view, source=view.source - self.shift) for view in views]
-
-    def update(self, found: TipEstimate) -> None:
-        """Take what an exposure shows: its posterior of the shift is the next one's prior."""
-        if found.status == "found":
-            self.shift = self.shift + found.shift
-            self.covariance = found.spread[3:, 3:] + _DRIFTS_MM**2 * np.eye(3)
 
 
 class ImageFluoroscope:
@@ -75,7 +41,8 @@ class ImageFluoroscope:
     Attributes:
         pose: in which the patient truly lies; nothing that is measured knows it.
         registration: the pose as one injection of contrast shows it.
-        displaced: how far the vessel lies from there, by all wires so far.
+        shift: how far the vessel lies from there, by all wires so far, LPS mm of the CT; `spread` is its covariance,
+            mm².
     """
 
     def __init__(
@@ -115,12 +82,14 @@ class ImageFluoroscope:
         self._detector = TipDetector(anatomy, device)
         self._project = TipProjector(anatomy.tree, anatomy.insertion)
         self._registered = self.registration.views(self._views, self._imager.isocenter)
+        self._photons = [self._imager.photons(plane) for plane in self._planes]
+        self._lines = list(map(self._detector.lines, self._registered, before, self._photons))
         self.forget_wires()
 
     def forget_wires(self) -> None:
         """Take the vessel to lie where contrast showed it, whatever the wires since: another navigation begins."""
-        sd_mm = self._detector.config.displaced_mm if self.known_motion is None else _MOVES_MM
-        self.displaced = Displaced(self._anatomy, self.registration, sd_mm)
+        off = DISPLACED_MM**2 * np.eye(3)  # of one who moves: their motion is not quite known
+        self.shift, self.spread = np.zeros(3), self.registration.place_covariance(self._anatomy) + off
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
@@ -157,13 +126,12 @@ class ImageFluoroscope:
         patient to lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
-        photons = [self._imager.photons(plane) for plane in self._planes]
-        views, covariance = self.displaced.views(self._registered), self.displaced.covariance
-        found = self._detector.find(views, signals, photons, inserted_length, before=self._before, displaced=covariance)
-        if found is None:
+        views = [replace(view, source=view.source - self.shift) for view in self._registered]
+        found = self._detector.estimate(views, signals, self._photons, inserted_length, self._lines, self.spread)
+        if found.status == "not found":
             return None
-        if self.known_motion is None:
-            self.displaced.update(found)
+        if self.known_motion is None and found.status == "found":
+            self.shift, self.spread = self.shift + found.shift, found.spread[3:, 3:] + DRIFTS_MM**2 * np.eye(3)
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
     def _signal(

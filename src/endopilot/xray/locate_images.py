@@ -23,12 +23,12 @@ from endopilot.progress import progress
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose, View, view_of
 from endopilot.xray.cine import XrayCine
-from endopilot.xray.detector import Signal, TipDetector, own_share
+from endopilot.xray.detector import Exposure, Signal, TipDetector, own_share
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
-from endopilot.xray.tip_filter import LocateConfig, TipLocation, goes, told_by_later
-from endopilot.xray.tip_posterior import TipEstimate
+from endopilot.xray.tip_filter import TipLocation
+from endopilot.xray.tip_posterior import LocateConfig, TipEstimate, told_by_later
 from endopilot.xray.vessel_grid import VesselGrid
 
 _EMPTY_SHARE = 0.9
@@ -101,55 +101,34 @@ def locate_in_images(
             raise InputError(f"{one.path}: {len(one.times_s)} frames, and {count} in {cines[0].path}; give one pair")
         if one.image != cines[0].image:
             raise InputError(f"{one.path}: has another geometry or size than {cines[0].path}; give two planes alike")
-    cines, poses, moves, registered, best, notes = _registered(anatomy, tuple(cines), config)
+    cines, laid, known, best, notes = _registered(anatomy, tuple(cines), config)
     isocenter = isocenter_of(anatomy)
-    views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose in poses]
+    views = [[view_of(one.view(isocenter), pose, isocenter) for one in cines] for pose, _ in laid]
     detector, photons = TipDetector(anatomy, device), [one.photons() for one in cines]
-    empty, fields = [_empty(one) for one in cines], [one.field() for one in cines]
-    found: list[TipEstimate] = []
-    planes = [
-        [_darkened(one, light, field) for one in cine.signals]
-        for cine, light, field in zip(cines, empty, fields, strict=True)
-    ]
-    dark = list(zip(*planes, strict=True))
-
-    def look(frame: int, expected: Float[np.ndarray, "places"] | None) -> TipEstimate:
-        shown = [one.signals[frame] for one in cines]
-        spread = _STIRS_MM**2 * np.eye(3) if moves[frame] is None else moves[frame]
-        return detector.estimate(views[frame], shown, photons, None, None, expected, spread, dark[frame])
-
+    planes = [_darkened(one.signals, _empty(one), one.field()) for one in cines]
+    dark, seen = list(zip(*planes, strict=True)), list[Exposure]()
     with progress(f"locate {anatomy.name}", count) as advance:
-        for frame in range(count):
-            found.append(look(frame, None))
+        for frame, (_, spread) in enumerate(laid):
+            shown = [one.signals[frame] for one in cines]
+            seen.append(detector.look(views[frame], shown, photons, (), spread, dark[frame]))
             advance()
     clear = [_is_clear(detector.grid, *each, photons) for each in zip(views, dark, strict=True)]
-    expected, likeliest = _by_other_times(detector.grid, config, cines[0].times_s, found, clear)
-    for frame, place in enumerate(likeliest):
-        if found[frame].status == "not found" or np.linalg.norm(found[frame].position - place) > _ELSEWHERE_MM:
-            found[frame] = look(frame, expected[frame])
+    found = _followed(detector, seen, clear, cines[0].times_s, config)
+    for frame, one in enumerate(found):
         # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
-        elsewhere = moves[frame] is not None or np.linalg.norm(found[frame].position - place) > _ELSEWHERE_MM
-        if found[frame].status == "found" and elsewhere:
-            found[frame] = replace(found[frame], status="ambiguous")
+        if frame not in known and one.status == "found":
+            found[frame] = replace(one, status="ambiguous")
     project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
     for frame, one in enumerate(found):
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
-        moved = poses[frame].move(one.position + one.shift, isocenter) - one.position
+        moved = laid[frame][0].move(one.position + one.shift, isocenter) - one.position
         if one.status == "not found":
             tips.append(TipLocation.nowhere(frame))
             continue
         at = project(one.position[None])
         tips.append(
-            TipLocation.at(
-                anatomy.tree,
-                (int(at.branch[0]), float(at.abscissa[0])),
-                frame=frame,
-                status=one.status,
-                position=one.position,
-                covariance=one.covariance,
-                share=one.share,
-                moved_mm=moved,
-                residual_mm=np.nan,
+            TipLocation.of(
+                anatomy.tree, frame, one, (int(at.branch[0]), float(at.abscissa[0])), moved_mm=moved, residual_mm=np.nan
             )
         )
     return ImagesLocated(
@@ -157,16 +136,20 @@ def locate_in_images(
         wires=tuple(None if one.status == "not found" else one.wire for one in found),
         views=tuple(map(tuple, views)),
         cines=cines,
-        registration=registered,
+        registration=known.get(best),
         best=best,
         notes=notes,
     )
 
 
+_Laid = list[tuple[Pose, Float[np.ndarray, "3 3"]]]
+"""How the patient lies in each frame, and the covariance of how far the vessel lies off, mm²."""
+
+
 def _registered(
     anatomy: Anatomy, cines: tuple[XrayCine, ...], config: LocateConfig
-) -> tuple[tuple[XrayCine, ...], list[Pose], list[np.ndarray | None], Registration | None, int, tuple[str, ...]]:
-    """Return the cines as they fit the vessel, the pose at each frame and how far off, the best one, and notes.
+) -> tuple[tuple[XrayCine, ...], _Laid, dict[int, Registration], int, tuple[str, ...]]:
+    """Return the cines as they fit the vessel, how it lies in each frame, frames that show it, the best one, and notes.
 
     Raises:
         InputError: nothing registers the patient.
@@ -178,7 +161,7 @@ def _registered(
             raise InputError("landmark_px: missing; give the pixel of the first frame that shows landmark_mm")
         pixel = (np.array(config.landmark_px) - (cines[0].signals.shape[1] - 1) / 2) * [1, -1]
         shift = shift_onto(cines[0].view(isocenter), np.array(config.landmark_mm), pixel)
-        return cines, [Pose(translation_mm=shift)] * count, [_MOVES_MM**2 * np.eye(3)] * count, None, 0, notes
+        return cines, [(Pose(translation_mm=shift), _MOVES_MM**2 * np.eye(3))] * count, {}, 0, notes
     before = [_empty(one) for one in cines]
     contrast = np.sum([_contrast(one, empty) for one, empty in zip(cines, before, strict=True)], axis=0)
     best = int(contrast.argmax())
@@ -204,18 +187,16 @@ def _registered(
             known |= {} if laid.failure else {frame: laid}
     most = max(one.correlation for one in known.values())
     known = {frame: one for frame, one in known.items() if one.correlation > most - _LESS}
-    poses = {frame: one.pose for frame, one in known.items()}
     # Where a frame shows no contrast, the vessel lies as far from its mean place as in those that do.
-    points = anatomy.tree.line.points[::8]
-    lies = np.array([one.move(points, isocenter) for one in poses.values()])
+    points, stirs = anatomy.tree.line.points[::8], _STIRS_MM**2 * np.eye(3)
+    lies = np.array([one.pose.move(points, isocenter) for one in known.values()])
     off = lies - lies.mean(axis=0)
-    spread = np.einsum("kni,knj->ij", off, off) / off[..., 0].size + _STIRS_MM**2 * np.eye(3)
+    spread = np.einsum("kni,knj->ij", off, off) / off[..., 0].size + stirs
     spread += max(_FEWEST - len(known), 0) / _FEWEST * _MOVES_MM**2 * np.eye(3)
-    mean = Pose.of_vector(np.mean([one.vector for one in poses.values()], axis=0))
-    moves = [None if frame in known else spread for frame in range(count)]
+    mean = Pose.of_vector(np.mean([one.pose.vector for one in known.values()], axis=0))
+    laid = [(known[frame].pose, stirs) if frame in known else (mean, spread) for frame in range(count)]
     best = max(known, key=lambda one: known[one].correlation)
-    poses = [poses.get(frame, mean) for frame in range(count)]
-    return cines, poses, moves, known[best], best, (*notes, *([said] if said else []))
+    return cines, laid, known, best, (*notes, *([said] if said else []))
 
 
 def _empty(cine: XrayCine) -> Signal:
@@ -223,13 +204,15 @@ def _empty(cine: XrayCine) -> Signal:
     return np.quantile(cine.signals, _EMPTY_SHARE, axis=0).astype(np.float32)
 
 
-def _darkened(shown: Signal, empty: Signal, field: Bool[np.ndarray, "rows rows"]) -> Signal:
+def _darkened(
+    shown: Float32[np.ndarray, "frames rows rows"], empty: Signal, field: Bool[np.ndarray, "rows rows"]
+) -> list[Signal]:
     """Return how much darker than without contrast the surroundings of each pixel are: a wire darkens them little.
 
     Where nothing is seen anything may be, contrast without bound.
     """
-    dark = gaussian_filter(empty - shown, _SURROUNDINGS_PX)
-    return np.where(field, np.maximum(dark - np.median(dark[field]), 0), np.float32(np.inf))
+    dark = [gaussian_filter(empty - one, _SURROUNDINGS_PX) for one in shown]
+    return [np.where(field, np.maximum(one - np.median(one[field]), 0), np.float32(np.inf)) for one in dark]
 
 
 def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Signal], photons: Sequence[float]) -> bool:
@@ -271,26 +254,35 @@ def _read_otherwise(
         yield tuple(seen), [empty[:, ::-1] if mirrored else empty for empty in before], said
 
 
-def _by_other_times(
-    grid: VesselGrid,
-    travel: LocateConfig,
-    times_s: Float[np.ndarray, "frames"],
-    found: Sequence[TipEstimate],
+def _followed(
+    detector: TipDetector,
+    seen: Sequence[Exposure],
     clear: Sequence[bool],
-) -> tuple[list[Float[np.ndarray, "places"]], Float[np.ndarray, "frames 3"]]:
-    """Return what the other frames say of the tip's place in each, and of whether there is one, a logarithm.
+    times_s: Float[np.ndarray, "frames"],
+    travel: LocateConfig,
+) -> list[TipEstimate]:
+    """Return where the tip is in each frame: by itself, and where that is nothing or elsewhere, by all frames.
 
-    And the likeliest place by all frames, LPS mm. Contrast looks alike in all frames that show it, however many there
-    are: those that are not `clear` of it say nothing of others. What looks like a wire and is none does so in all
-    frames: of whether there is one, they say no more than the clearest.
+    Contrast looks alike in all frames that show it, however many there are: those that are not `clear` of it say
+    nothing of others. What looks like a wire and is none does so in all frames: of whether there is one, they say no
+    more than the clearest.
     """
+    grid = detector.grid
+    anywhere = np.where(grid.branch < 0, -np.inf, 0.0)
+    told = [detector.tell(one, anywhere) for one in seen]
+    found = [detector.judge(one, said, anywhere, odds) for one, (said, odds) in zip(seen, told, strict=True)]
     tells = [sees and one.status != "not found" for sees, one in zip(clear, found, strict=True)]
-    seen = [np.where(grid.branch < 0, -np.inf, one.ends if own else 0.0) for own, one in zip(tells, found, strict=True)]
-    flows = [goes(grid, travel, float(step)) for step in np.maximum(np.diff(times_s), 1e-3) / _FRAME_S]
-    later = told_by_later(seen, lambda k: flows[k])
-    before = told_by_later(seen[::-1], lambda k: flows[-1 - k].T)[::-1]
-    others = [a + b for a, b in zip(later, before, strict=True)]
-    likeliest = [int((log + one).argmax()) for log, one in zip(seen, others, strict=True)]
+    said = [one._replace(log=anywhere + (one.log if own else 0.0)) for own, (one, _) in zip(tells, told, strict=True)]
+    frames = np.maximum(np.diff(times_s), 1e-3) / _FRAME_S
+    later = told_by_later(grid, travel, said, frames)
+    before = told_by_later(grid, travel, said[::-1], frames[::-1])[::-1]
     odds = np.where(tells, [one.log_odds for one in found], 0.0)
-    expected = [one - np.logaddexp.reduce(one) + np.delete(odds, k).max(initial=0.0) for k, one in enumerate(others)]
-    return expected, grid.middle[likeliest]
+    for k, one in enumerate(seen):
+        others = anywhere + later[k] + before[k]
+        place = grid.middle[(said[k].log + others).argmax()]
+        if found[k].status == "not found" or np.linalg.norm(found[k].position - place) > _ELSEWHERE_MM:
+            again, own = detector.tell(one, others)
+            found[k] = detector.judge(one, again, others, own + float(np.delete(odds, k).max(initial=0.0)))
+            if found[k].status == "found" and np.linalg.norm(found[k].position - place) > _ELSEWHERE_MM:
+                found[k] = replace(found[k], status="ambiguous")
+    return found

@@ -79,6 +79,13 @@ class Registration:
         """Return views that were given in the C-arm's frame in the CT's frame."""
         return [view_of(view, self.pose, isocenter) for view in views]
 
+    def place_covariance(self, anatomy: Anatomy) -> Float[np.ndarray, "3 3"]:
+        """Return what is left open of where the vessel lies, mm², the mean over it."""
+        points, isocenter = anatomy.tree.line.points[::8], isocenter_of(anatomy)
+        moved = [Pose.of_vector(self.pose.vector + step) for step in np.linalg.cholesky(self.covariance).T]
+        off = np.array([one.move(points, isocenter) for one in moved]) - self.pose.move(points, isocenter)
+        return np.einsum("kni,knj->ij", off, off) / len(points)
+
 
 def register(
     anatomy: Anatomy,

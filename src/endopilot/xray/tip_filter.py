@@ -11,16 +11,16 @@ of pose, of breathing, and of how far the device lies off its way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.errors import InputError
 from endopilot.progress import progress
-from endopilot.settings import Finite, NonNegative, OpenShare, Positive, Within, public, settings
+from endopilot.settings import public
 from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import Pose, View
@@ -35,7 +35,7 @@ from endopilot.xray.line_observations import (
     shift_onto,
     shown_by,
 )
-from endopilot.xray.tip_posterior import Status, around_mode
+from endopilot.xray.tip_posterior import LocateConfig, Status, TipEstimate, Told, estimated, goes, told_by_later
 from endopilot.xray.vessel_grid import VesselGrid, make_grid
 
 _STEP_MM = 1.0
@@ -56,7 +56,6 @@ _STRAY, _BEYOND = np.log(1 / 200), -2.5
 vessel before the root, where the way is not known."""
 _LEAST_ODDS = 20.0
 """A line is the device's where it is likelier so, by this logarithm, than if its points were strays."""
-_LEAST = 1e-300
 _ROUNDS = 3
 _PRUNE, _MOST = 18.0, 600
 """Places whose tip alone is less likely than the best one's by this logarithm are not compared further, nor more than
@@ -65,29 +64,6 @@ _NEAR_MM = 12.0
 """Mean and covariance are those of the posterior within this distance of its mode, mm."""
 _SURE = 0.9
 """A tip is ambiguous where less of the posterior lies there."""
-
-
-@settings
-class LocateConfig:
-    """What is known of patient and device before the first frame."""
-
-    landmark_mm: tuple[Finite, Finite, Finite] | None = None
-    """A point of the CT, LPS mm, that the first frame shows: the tip, if no pixel is given. Without one the wire itself
-    registers the patient."""
-    landmark_px: tuple[Finite, Finite] | None = None
-    """Column and row of the landmark in the first camera's image, pixels."""
-    registration_sd_mm: Positive = 30.0
-    """How far the patient may lie from where the cameras have the CT, without a landmark: standard deviation, mm."""
-    turn_sd_deg: NonNegative = 4.0
-    """And how far they may be turned about each axis, degrees."""
-    breathing_sd_mm: NonNegative = 4.0
-    """How far heart and breath move the vessel about its mean place: standard deviation, mm."""
-    travel_mm: Positive = 4.0
-    """How far the tip goes along the vessel from frame to frame, in the mean, mm."""
-    stiff_mm: Annotated[float, Within(0, 100)] = 6.0
-    """Length of the vessel over which the device straightens it, mm."""
-    anywhere_share: OpenShare = 0.02
-    """Share of the frames in which the tip may be anywhere, whatever the frames before say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +96,13 @@ class TipLocation:
     residual_mm: float
 
     @classmethod
-    def at(cls, tree: VesselTree, place: tuple[int, float], **rest: Any) -> TipLocation:
-        """Return a location, given branch and abscissa, mm, of the place, and all attributes that do not follow."""
+    def of(cls, tree: VesselTree, frame: int, found: TipEstimate, place: tuple[int, float], **rest: Any) -> TipLocation:
+        """Return a location, given branch and abscissa, mm, of the place, and how the vessel and the line lie."""
         branch, abscissa = place
         line = tree.branches[branch]
-        section = line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]
-        return cls(branch=branch, abscissa=abscissa, section=tree.section_names[section], **rest)
+        section = tree.section_names[line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]]
+        seen = (frame, found.status, found.position, found.covariance, found.share)
+        return cls(*seen, abscissa, branch, section, **rest)
 
     @classmethod
     def nowhere(cls, frame: int) -> TipLocation:
@@ -149,39 +126,15 @@ class _Fit(NamedTuple):
     aside_covariance: Float[np.ndarray, "m 3 3"]
 
 
-def goes(grid: VesselGrid, config: LocateConfig, frames: float) -> Float[np.ndarray, "n n"]:
-    """Return how likely the tip goes from each place to each in so many frames' time."""
-    stay = np.exp(-grid.distance / (config.travel_mm * frames))
-    rare = min(config.anywhere_share * frames, 0.5)
-    return (1 - rare) * stay / stay.sum(axis=1, keepdims=True) + rare / len(stay)
-
-
-def told_by_later(
-    seen: Sequence[Float[np.ndarray, "_"]], going: Callable[[int], Float[np.ndarray, "_ _"]]
-) -> list[Float[np.ndarray, "_"]]:
-    """Return what all later frames say of the tip's place in each, a logarithm, as `seen` says of each by itself.
-
-    `going` returns how likely the tip goes from each place of a frame to each of the next one, given the frame's index.
-    """
-    told = [np.zeros(len(seen[-1]))] if len(seen) else []
-    for k in range(len(seen) - 1, 0, -1):
-        log = seen[k] + told[-1]
-        told.append(np.log(going(k - 1) @ np.exp(log - log.max()) + _LEAST))
-    return told[::-1]
-
-
 class _Seen(NamedTuple):
-    """What a frame says of some places of the grid: the odds of its line, and with those before it, logarithms.
+    """A frame's number, what its lines say of some places, and with the frames before, the lines' residuals, mm.
 
-    And how far the vessel lies there from where the cameras have the CT, LPS mm, and the line's residual, mm.
+    And how far the vessel lies there from where the cameras have the CT, LPS mm.
     """
 
     frame: int
-    places: Int[np.ndarray, "m"]
-    odds: Float[np.ndarray, "m"]
-    log: Float[np.ndarray, "m"]
-    fit: _Fit
-    moved: Float[np.ndarray, "m 3"]
+    told: Told
+    before: Float[np.ndarray, "m"]
     residual_mm: Float[np.ndarray, "m"]
 
 
@@ -239,17 +192,19 @@ class TipFilter:
         if np.logaddexp.reduce(self._log[places] + odds) < (_LEAST_ODDS if whole else 0.0):
             return TipLocation.nowhere(frame)
         odds = odds + (_BEYOND - _STRAY) * beyond
-        log = self._log[places] + odds
-        log -= np.logaddexp.reduce(log)
+        before = self._log[places]
         self._log = np.full_like(self._log, -np.inf)
-        self._log[places] = log
+        self._log[places] = before + odds - np.logaddexp.reduce(before + odds)
         self._mean[places], self._covariance[places] = fit.mean, fit.covariance
         left = np.abs(rows.value - np.einsum("mri,mri->mr", rows.towards, fit.moved))
         of_line = rows.used & (rows.place != places[:, None])
         moved = (self._moved(base) - self._way)[places] + fit.moved[:, 0]
         residual = np.where(of_line, left, 0.0).sum(axis=1) / np.where(of_line.any(1), of_line.sum(1), np.nan)
-        self._seen.append(_Seen(frame, places, odds, log, fit, moved, residual))
-        return self._answer(self._seen[-1], log)
+        spread = np.zeros((len(places), 6, 6))
+        spread[:, :3, :3] = fit.aside_covariance
+        told = Told(places, odds, np.concatenate([fit.aside, moved], axis=1), spread)
+        self._seen.append(_Seen(frame, told, before, residual))
+        return self._answer(self._seen[-1], before)
 
     def smooth(self) -> dict[int, TipLocation]:
         """Return where the tip is in each frame that shows it, by all frames, those after too.
@@ -259,17 +214,9 @@ class TipFilter:
         """
         if self._registers_itself:
             return {}
-        found, all_seen = {}, self._seen
-        frames = np.diff([one.frame for one in all_seen])
-
-        def going(k: int) -> Float[np.ndarray, "_ _"]:
-            flow = goes(self.grid, self.config, float(frames[k]))
-            return flow[np.ix_(all_seen[k].places, all_seen[k + 1].places)]
-
-        for one, later in zip(all_seen, told_by_later([one.odds for one in all_seen], going), strict=True):
-            log = one.log + later
-            found[one.frame] = self._answer(one, log - np.logaddexp.reduce(log))
-        return found
+        frames = np.diff(np.array([one.frame for one in self._seen], dtype=float))
+        told = told_by_later(self.grid, self.config, [one.told for one in self._seen], frames)
+        return {one.frame: self._answer(one, one.before + later) for one, later in zip(self._seen, told, strict=True)}
 
     def _begin(self, lines: Sequence[Line | None]) -> bool:
         """Register the patient by the landmark, if there is one; return whether it was seen or is not needed."""
@@ -357,25 +304,18 @@ class TipFilter:
         beside = aside[:, :1, :1] * np.eye(3) - own.swapaxes(1, 2) @ solved[..., 7:]
         return _Fit(log_density, base + pose, left, moved, np.einsum("mri,mr->mi", own, weight), beside)
 
-    def _answer(self, seen: _Seen, log: Float[np.ndarray, "m"]) -> TipLocation:
-        """Return mean and covariance around the mode of the posterior."""
-        grid, places, weight = self.grid, seen.places, np.exp(log)
-        best = int(weight.argmax())
-        near = np.linalg.norm(grid.middle[places] - grid.middle[places[best]], axis=1) <= _NEAR_MM
-        close = places[near]
-        share, mean, covariance = around_mode(grid.middle[places] + seen.fit.aside, weight, near, grid.step_mm)
-        weight = weight[near] / share
-        covariance = covariance + np.einsum("m,mij->ij", weight, seen.fit.aside_covariance[near])
-        place = int(close[np.linalg.norm(grid.middle[close] - weight @ grid.middle[close], axis=1).argmin()])
-        return TipLocation.at(
+    def _answer(self, seen: _Seen, prior: Float[np.ndarray, "m"]) -> TipLocation:
+        """Return where the tip is, given what other frames say of the places."""
+        found, places = estimated(self.grid, seen.told, prior, _NEAR_MM), seen.told.places
+        near = places[np.linalg.norm(self.grid.middle[places] - self.grid.middle[found.mode], axis=1) <= _NEAR_MM]
+        place = near[np.linalg.norm(self.grid.middle[near] - found.position, axis=1).argmin()]
+        best = np.searchsorted(places, found.mode)
+        return TipLocation.of(
             self._tree,
-            (int(grid.branch[place]), float(grid.abscissa[place])),
-            frame=seen.frame,
-            status="found" if share >= _SURE else "ambiguous",
-            position=mean,
-            covariance=covariance,
-            share=share,
-            moved_mm=seen.moved[best],
+            seen.frame,
+            found if found.share >= _SURE else replace(found, status="ambiguous"),
+            (int(self.grid.branch[place]), float(self.grid.abscissa[place])),
+            moved_mm=seen.told.mean[best, 3:],
             residual_mm=float(seen.residual_mm[best]),
         )
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import map_coordinates, uniform_filter1d
+from scipy.optimize import leastsq
 from scipy.special import ndtr
 
 from endopilot.xray.carm import View
@@ -16,8 +18,6 @@ from endopilot.xray.tip_posterior import TipEstimate
 Image = Float32[np.ndarray, "rows columns"]
 _END_PLACES = 4
 """Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
-_BESIDE_STRAND_PX = 3.0
-"""So far on either side the end of a wire that folds is looked for, pixels: the other strand lies in the middle."""
 _LEAD_PX, _OF_PIXEL, _STRAIGHT_PX = 12, 0.3, 1.0
 """Length of the wire before its end that shows how far aside it runs, pixels; weight of the evidence of each, since
 neighbours share their noise; standard deviation of what a straight line leaves out, pixels."""
@@ -28,6 +28,9 @@ _FIT_PX = 0.6
 three arteries, and with 0.35 alone the region of 95 % held 62 % of the tips in one of them."""
 _BELIEVABLE = 3.0
 """An end farther than this many standard deviations from the posterior's is another line's."""
+_DOUBT = 0.3
+"""An end this many times its squared distance from the posterior's, in standard deviations, is less sure: it may be
+another line's, which the fit does not know."""
 BLUR_PX = 0.6
 """Standard deviation of the detector's blur, pixels."""
 _RADIUS_PX, _NEAR_PX = 9, 5.4
@@ -37,9 +40,8 @@ _TURNS = np.deg2rad([0.0, -40.0, 40.0, -90.0, 90.0])
 """The line is fitted from each of these angles to the first guess, rad: tips are bent."""
 _FITTED = 2
 """So many of these are fitted, those that the pixels fit best before."""
-_DIFFERENCE, _SINGULAR = 1e-4, 1e-9
-_STEPS, _CONVERGED = 12, 1e-5
-"""Steps of a fit at most; it ends where one lowers the errors by a smaller share."""
+_SINGULAR, _CONVERGED = 1e-9, 1e-4
+"""A fit ends where a step changes the line or lowers the errors by a smaller share."""
 _MOST_BEND = 0.12
 """Largest curvature of the line, 1/pixel: 70° over 3 mm."""
 _FARTHEST_PX = 6.0
@@ -75,48 +77,28 @@ def fit_end(
     dark = -near * square.ravel()
     dark = dark - flat @ (flat.T @ dark)
 
-    def errors(x: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k n"]:
-        """Return the errors of bent lines that end, each as dark as fits best, of ends, angles and bends."""
-        cos, sin = np.cos(x[:, 2:3]), np.sin(x[:, 2:3])
-        behind = cos * (x[:, :1] - right) + sin * (x[:, 1:2] - up)
-        aside = cos * (up - x[:, 1:2]) - sin * (right - x[:, :1]) - 0.5 * x[:, 3:] * np.maximum(behind, 0.0) ** 2
-        lines = near * np.exp(-0.5 * (aside / width_px) ** 2) * ndtr(behind / width_px)
-        lines -= (lines @ flat) @ flat.T
-        return dark - lines * ((lines @ dark) / ((lines**2).sum(axis=1) + _SINGULAR))[:, None]
+    def errors(x: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n"]:
+        """Return the errors of a bent line that ends, as dark as fits best, of its end, angle and bend."""
+        cos, sin, bend = np.cos(x[2]), np.sin(x[2]), _MOST_BEND * np.tanh(x[3])
+        behind = cos * (x[0] - right) + sin * (x[1] - up)
+        aside = cos * (up - x[1]) - sin * (right - x[0]) - 0.5 * bend * np.maximum(behind, 0.0) ** 2
+        line = near * np.exp(-0.5 * (aside / width_px) ** 2) * ndtr(behind / width_px)
+        line -= flat @ (flat.T @ line)
+        return dark - line * (line @ dark / (line @ line + _SINGULAR))
 
-    turned = np.arctan2(forwards[1], forwards[0]) + _TURNS
-    starts = np.stack([0 * turned, 0 * turned, turned, 0 * turned], axis=-1)
-    order = (errors(starts) ** 2).sum(axis=1).argsort(kind="stable")[:_FITTED]
-    end, error, slope = min((_fitted(errors, start) for start in starts[order]), key=lambda fit: fit[1] @ fit[1])
+    turns = np.arctan2(forwards[1], forwards[0]) + _TURNS
+    starts = [np.array([0.0, 0.0, turn, 0.0]) for turn in turns]
+    starts.sort(key=lambda start: float((errors(start) ** 2).sum()))
+    fits: Any = (
+        leastsq(errors, start, full_output=True, xtol=_CONVERGED, ftol=_CONVERGED) for start in starts[:_FITTED]
+    )
+    end, covariance, how, *_ = min(fits, key=lambda fit: fit[2]["fvec"] @ fit[2]["fvec"])
+    error = how["fvec"]
     line, variance = dark - error, float(error @ error) / max(float(near @ near) - 8, 1.0)
     faint = line @ dark <= 0 or np.linalg.norm(line) < _CLEAR * np.sqrt(variance)
-    if faint or np.abs(end[:2]).max() > 0.98 * _FARTHEST_PX:
+    if faint or covariance is None or np.abs(end[:2]).max() > _FARTHEST_PX:
         return None
-    spread = variance * np.linalg.pinv(slope.T @ slope)[:2, :2]
-    return guess + end[:2], spread + _OWN_PX**2 * np.eye(2)
-
-
-def _fitted(
-    errors: Callable[[np.ndarray], np.ndarray], x: Float[np.ndarray, "4"]
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n"], Float[np.ndarray, "n 4"]]:
-    """Return the numbers of the least errors near a start, by Levenberg and Marquardt's steps, errors and slope."""
-    bounds = np.array([_FARTHEST_PX, _FARTHEST_PX, np.inf, _MOST_BEND])
-    steps, damping = np.vstack([np.zeros(4), _DIFFERENCE * np.eye(4)]), 0.1
-    error, *around = errors(x + steps)
-    for _ in range(_STEPS):
-        slope = (np.array(around) - error).T / _DIFFERENCE
-        square = slope.T @ slope
-        square[np.diag_indices(4)] += damping * np.diag(square) + _SINGULAR
-        tried = np.clip(x - np.linalg.solve(square, slope.T @ error), -bounds, bounds)
-        new, *its = errors(tried + steps)
-        cost, gained = error @ error, error @ error - new @ new
-        if gained > 0:
-            x, error, around, damping = tried, new, its, 0.2 * damping
-        else:
-            damping *= 8.0
-        if 0 < gained < _CONVERGED * cost:
-            break
-    return x, error, (np.array(around) - error).T / _DIFFERENCE
+    return guess + end[:2], variance * covariance[:2, :2] + _OWN_PX**2 * np.eye(2)
 
 
 def refined(
@@ -128,25 +110,27 @@ def refined(
 ) -> TipEstimate:
     """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
 
-    Signals are without contrast; views, evidence and shift are as `estimate_tip` takes them.
+    Views, signals without contrast and evidence are those of `TipDetector.look`.
     """
     mean, spread = found.mean, found.spread
     wire = found.wire[-_END_PLACES:] - found.position
 
     def seen(
         view: View, row: Float[np.ndarray, "k 2"], error: Float[np.ndarray, "k"], own: Float[np.ndarray, "k k"]
-    ) -> bool:
+    ) -> None:
         """Take an error in pixels, along some directions of the image, if it is believable."""
         nonlocal mean, spread
         slope = row @ view.slope(mean[:3] + mean[3:])
         both = np.hstack([slope, slope])
         expected = both @ spread @ both.T + own
-        if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
-            return False
+        off = error @ np.linalg.solve(expected, error)
+        if off > _BELIEVABLE**2:
+            return
+        own = (1 + _DOUBT * off) * own
+        expected = both @ spread @ both.T + own
         gain = spread @ both.T @ np.linalg.inv(expected)
         rest = np.eye(6) - gain @ both
         mean, spread = mean + gain @ error, rest @ spread @ rest.T + gain @ own @ gain.T  # stays positive
-        return True
 
     for view, signal, image in zip(views, signals, evidence, strict=True):
         at = mean[:3] + mean[3:]
@@ -156,14 +140,12 @@ def refined(
         if seen_px < _SEEN_SHARE * per_mm * there_mm:
             continue
         axes = np.array([forwards, [-forwards[1], forwards[0]]]) / seen_px
-        if not found.folded:  # the other strand goes on
-            slope = axes @ np.hstack([view.slope(at)] * 2)
-            seen(view, axes, *_ends(image, view.project(at), axes, slope @ spread @ slope.T))
+        slope = axes @ np.hstack([view.slope(at)] * 2)
+        seen(view, axes, *_ends(image, view.project(at), axes, slope @ spread @ slope.T))
         guess, width_px = view.project(mean[:3] + mean[3:]), float(np.hypot(0.5 * radius_mm * per_mm, BLUR_PX))
-        for aside in (0.0, -_BESIDE_STRAND_PX, _BESIDE_STRAND_PX)[: 3 if found.folded else 1]:
-            end = fit_end(signal, guess + aside * axes[1], forwards, width_px)
-            if end is not None and seen(view, np.eye(2), end[0] - guess, end[1] + _FIT_PX**2 * np.eye(2)):
-                break
+        end = fit_end(signal, guess, forwards, width_px)
+        if end is not None:
+            seen(view, np.eye(2), end[0] - guess, end[1] + _FIT_PX**2 * np.eye(2))
     return replace(found, mean=mean, spread=spread)
 
 
