@@ -58,7 +58,7 @@ class RemoteRobot:
             self.limits = self._greet(Path(certificates))
             self.arm()
         except BaseException:
-            self._socket.close()
+            self._lose("it was refused")
             raise
         self._living = threading.Thread(target=self._live, daemon=True)
         self._living.start()
@@ -193,6 +193,7 @@ class RemoteRobot:
 
     def _lose(self, reason: str) -> None:
         self._lost = self._lost or reason
+        self._lines.close()  # a socket stays open as long as a file on it
         self._socket.close()
 
     def _gone(self) -> InputError:
