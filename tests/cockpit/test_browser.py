@@ -97,6 +97,7 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
     until(page, "cockpit.shown.autopilot.status === 'drives' && cockpit.shown.velocity[0] > 0")
     hold(page, "KeyS", "cockpit.shown.autopilot.status === 'off' && cockpit.shown.velocity[0] < 0")
     page.keyboard.up("KeyS")
+    page.evaluate("() => cockpit.connection.send('target', {branch: 0, abscissa: 12})")
     page.click("#autopilot-start")
     end = time.monotonic() + 120.0
     while value(page, "cockpit.shown.autopilot.status !== 'reached'"):
@@ -111,19 +112,19 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
 
 def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
     page = opened(context, server)
-    hold(page, "KeyW", "cockpit.shown.inserted_length_mm > 12")
+    hold(page, "KeyW", "cockpit.shown.inserted_length_mm > 6")
     page.keyboard.up("KeyW")
-    hold(page, "KeyD", "cockpit.shown.rotation_deg > 40")
+    hold(page, "KeyD", "cockpit.shown.rotation_deg > 20")
     page.keyboard.up("KeyD")
     until(page, "cockpit.shown.velocity.every((v) => v === 0)")
-    time.sleep(1.0)
+    time.sleep(0.5)
     cycle, nodes = value(page, "[cockpit.state.cycle, Array.from(cockpit.state.nodes)]")
     server.kill()
     until(page, "!document.getElementById('banner').hidden")
     with serving("--resume", server.recording) as again:
         resumed = opened(context, again)
-        assert value(resumed, "cockpit.shown.inserted_length_mm") == pytest.approx(13, abs=3.0)
-        hold(resumed, "KeyS", "cockpit.shown.inserted_length_mm < 11")
+        assert value(resumed, "cockpit.shown.inserted_length_mm") == pytest.approx(7, abs=3.0)
+        hold(resumed, "KeyS", "cockpit.shown.inserted_length_mm < 5")
         resumed.keyboard.up("KeyS")
     recording = read_session(Path(server.recording))
     then = next((world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle), None)

@@ -103,7 +103,7 @@ def _too_fast(content: dict) -> dict:
     return {name: value for name, value in forged.items() if name != "course"}
 
 
-def test_a_submission_is_confirmed_in_other_processes(written, check, in_processes):
+def test_a_submission_is_confirmed(written, check):
     found = check(written)
     assert (found.verdict, found.difference, found.navigations, found.remarks) == ("decided again", None, 2, ())
     assert [submitted(row) for row in found.scores] == written["scores"]  # as they were driven again
