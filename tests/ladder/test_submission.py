@@ -14,7 +14,6 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
-from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
@@ -80,19 +79,6 @@ def _record(content: dict, change) -> None:
     entry["recording"] = Recording(control, exposed, None).packed()
 
 
-def _at(row: int, column: int, factor: float):
-    def change(control, exposed):
-        control[row, 0, column] = control[row, 0, column] * factor + (factor - 1)
-        return control, exposed
-
-    return change
-
-
-def _swap_exposures(control, exposed):
-    exposed[3] = True
-    return control, exposed
-
-
 def _too_fast(content: dict) -> dict:
     """Return a navigation whose drive is commanded more than it does, with the hash of that."""
     was, navigation = Recording.unpacked(_first(content)["recording"]), find_task("straight").ladder_navigation(0)
@@ -135,15 +121,10 @@ def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
     ("change", "difference"),
     [
         (lambda c: _first(c).update(peak_force_n=0.0123), "peak_force_n is 0.0123 in the file and 0."),
-        (lambda c: _first(c).update(path_ratio=np.nextafter(_first(c)["path_ratio"], 2)), "path_ratio is "),
-        (lambda c: _first(c).update(exposures=0), "exposures is 0 in the file and 1 when driven again"),
-        (lambda c: _first(c).update(success=False), "success is false in the file and true"),
         (lambda c: _first(c).update(patient="nobody"), 'patient is "nobody" in the file'),
-        (lambda c: _first(c).update(events=[3, 0]), "events is "),
         (lambda c: _first(c).update(sha256="0" * 64), "decisions or course are not those"),
-        (lambda c: _record(c, _at(4, 0, 1 + 1e-12)), ""),
-        (lambda c: _record(c, _at(4, 1, 1 + 1e-12)), ""),
-        (lambda c: _record(c, _swap_exposures), "exposures is 1 in the file and 2"),
+        (lambda c: _record(c, lambda v, x: (v * (1 + 1e-12), x)), ""),
+        (lambda c: _record(c, lambda v, x: (v, x | (np.arange(len(x)) == 3))), "exposures is 1 in the file and 2"),
         (lambda c: _record(c, lambda v, x: (v[:-1], x[:-1])), "decisions, and the navigation goes on"),
         (lambda c: _record(c, lambda v, x: (np.vstack([v, v]), np.hstack([x, x]))), "and the navigation ends after"),
         (lambda c: _record(c, lambda v, x: (v, ~x)), "X-ray is off at the first decision"),
@@ -250,11 +231,6 @@ def _of_a_better_hand(content: dict) -> None:
     _again(content, lambda was: replace(was, control=was.control * [1.0 + 1e-9, 1.0]))
 
 
-def _of_another_version(content: dict) -> None:
-    content["origin"] = "endopilot 0.0.1"
-    _without_exposures(content)
-
-
 def _left_out(content: dict) -> None:
     for of in (content["tasks"], content["navigations"]):
         del of["descending"]
@@ -286,10 +262,8 @@ def looking(tmp_path_factory) -> dict:
     [
         (_made_up, "seconds is 0.5 in the file and "),
         (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell or openblas SkylakeX"),
-        (lambda c: c.update(blas=None), "blas: none; "),
         (_of_another_kernel, None),  # or this machine lacks the kernel
         (_without_exposures, "retract-rotate decides otherwise"),
-        (_of_another_version, "retract-rotate decides otherwise"),
         (_of_a_better_hand, "retract-rotate decides otherwise"),
         (_in_another_patient, "task straight, patient 0: "),
         (lambda c: c["scores"][0].update(safe_success=0.999), "scores, straight: safe_success is 0.999 in the file"),
@@ -297,8 +271,6 @@ def looking(tmp_path_factory) -> dict:
         (_twice, "task straight, patient 1: patient is "),
         (lambda c: c.update(world=asdict(World(friction_factor=0.2))), "key.world: {}; from all else follows {"),
         (lambda c: _on_terms(c, world=World(friction_factor=0.2)), "in the file and"),
-        (lambda c: c.update(robot=asdict(read_robot("kweon-2021-2d"))), "key.robot: {}; from all else follows {"),
-        (lambda c: _on_terms(c, robot=read_robot("kweon-2021-2d")), "in the file and"),
         (lambda c: _on_terms(c, thinking_s=0.5), "decisions, and the navigation goes on"),
         (lambda c: c.update(drawn="mine"), "straight, patient 0: seed 100; the ladder's is"),
         (lambda c: c["key"].update(settings="0" * 64), "key.settings: "),
