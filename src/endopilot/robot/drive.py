@@ -58,27 +58,15 @@ _NUMBER = re.compile(
 
 
 class Drive:
-    """The machine: motion, watchdog, and who may command.
-
-    Attributes:
-        stopped: why the drive stands still, or None while it is armed: "start", "silence", "connection", "not-finite",
-            "limit", "travel", "malformed" or "asked".
-        dropped: commands that came with a ticket too old, void or never given.
-        owner: the session that commands, if any.
-        news: lines for people, on stops, clients and strangers; whoever shows them takes them out.
-    """
+    """The machine: motion, watchdog, and who may command (`owner`). `stopped` is why it stands still, or None while it
+    is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked"; `dropped`
+    counts commands whose ticket was too old, void or never given; `news` are lines for people, who take them out."""
 
     def __init__(
         self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
     ) -> None:
-        """Stand still, unarmed.
-
-        Args:
-            limits: a command beyond them, or the end of the travel, stops the drive.
-            now: time by the drive's clock, s.
-            config: latency, accelerations and noise; the encoders sit at the motor, for there is no wire.
-            inserted_length: Δ at the start, mm.
-        """
+        """Stand still, unarmed, at Δ (mm) and at a time by the drive's clock (s); a command beyond the limits, or the
+        end of the travel, will stop it. The encoders sit at the motor, for there is no wire."""
         config = config or RobotConfig()
         self._limits, start = limits, np.array([[[inserted_length, 0.0]]])
         self._motion = DriveMotion(config, [[limits]], start)
@@ -135,13 +123,8 @@ class Drive:
             self.stopped, self._state, self._heard = None, None, heard
 
     def move(self, ticket: str, translation: float, rotation: float) -> None:
-        """Take a command, mm/s and rad/s, if armed; the newest of one instant alone is obeyed.
-
-        Args:
-            ticket: that the drive gave so lately that it lasts; with any other nothing happens.
-            translation: one that is not finite or beyond the limits stops the drive.
-            rotation: likewise.
-        """
+        """Take a command, mm/s and rad/s, if armed and the ticket lasts; the newest of one instant alone is obeyed, and
+        one that is not finite or beyond the limits stops the drive."""
         heard = self._given(ticket)
         if heard is None or self.stopped is not None:
             return
@@ -212,14 +195,8 @@ class Session:
         self._drive, self._held, self.closed = drive, b"", False
 
     def receive(self, data: bytes, now: float) -> bytes:
-        """Take what one read brought and return the answers, one for each line that it ends.
-
-        A line that never ends closes the session.
-
-        Args:
-            data: bytes as they came, cut anywhere.
-            now: time by the drive's clock, s.
-        """
+        """Take bytes as they came, cut anywhere, and return an answer for each line that they end; a line that never
+        ends closes the session."""
         self._drive.tick(now)
         if self.closed:
             return b""
@@ -270,17 +247,9 @@ def number(text: str) -> float | None:
 
 
 def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
-    """Return the TLS settings of one side: its own key and certificate, and the one certificate that it trusts.
-
-    Args:
-        folder: holds PEM files: `drive.key`, `drive.crt` and `client.crt` for the drive; `client.key`, `client.crt` and
-            `drive.crt` for the client.
-        of_drive: for the drive, or for its client.
-
-    Raises:
-        InputError: a file is missing or holds something else; the key is encrypted, open to others, or of another
-            certificate.
-    """
+    """Return the TLS settings of the drive or of its client: its own key and certificate, and the one that it trusts,
+    PEM files in a folder (`drive.key`, `drive.crt`, `client.crt`; `client.key`, `client.crt`, `drive.crt`). InputError
+    where one is missing or holds something else, or the key is encrypted, open to others, or of another certificate."""
     side, other = ("drive", "client") if of_drive else ("client", "drive")
     key, own, trusted = folder / f"{side}.key", folder / f"{side}.crt", folder / f"{other}.crt"
     mend = f"copy it there, or make both sides' with `{_recipe(folder)}`"
@@ -316,18 +285,8 @@ def _recipe(folder: Path) -> str:
 
 
 async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say: Callable[[str], None]) -> None:
-    """Let a drive listen and run until SIGTERM, or until it is cancelled.
-
-    Args:
-        drive: made with `now=time.monotonic()`.
-        context: of `tls_context`.
-        host: address to listen on.
-        port: TCP port; 0 for a free one.
-        say: called with each line for people.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
+    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until SIGTERM, or until it
+    is cancelled; `say` is called with each line for people. InputError where the address cannot be listened on."""
 
     async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if drive.owner is None:
