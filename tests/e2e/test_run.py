@@ -112,7 +112,7 @@ def tiny_ct(seed: int) -> Volume:
     return Volume(voxels, np.ones(3), np.zeros(3), np.eye(3))
 
 
-OF_DEMO = ("--patients", "3", "--sequences", "1", "--seconds", "20")
+OF_DEMO = ("--patients", "3", "--sequences", "1", "--seconds", "10")
 DEMO_STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot
+from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import is_coronary, surroundings
 from endopilot.xray.carm import view_at
@@ -64,7 +64,7 @@ class XrayUnit:
         self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
         """Compute the first view in the background; without a CT (HU) a coronary artery lies in a phantom's."""
-        self.settings = XraySettings()
+        self.settings, self._anatomy = XraySettings(), anatomy
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
         self._image_s = self._contrast_s = -np.inf
@@ -157,23 +157,26 @@ class XrayUnit:
             "contrast": round(self.contrast(now_s), 2),
             "has_roadmap": any(plane in self._roadmap for plane in settings.planes),
             "background": self.background,
-            "angles_deg": settings.angles_deg,
-            "zoom": settings.zoom,
-            "biplane": settings.biplane,
-            "frames_per_s": settings.frames_per_s,
-            "dose": settings.dose,
-            "roadmap": settings.roadmap,
+            **vars(settings),
         }
 
-    def pixels(self, point: Float[np.ndarray, "3"]) -> list[list[float]]:
-        """Return where a point of the patient, LPS mm, lies in the image of each plane: column and row."""
-        found = []
+    def seen(self, now_s: float, target: Target) -> dict[str, Any]:
+        """Return what the page shows of the unit and of a target: place, LPS mm, branch, abscissa (mm), section, and
+        column and row in the image of each plane."""
+        branch, position = self._anatomy.tree.branches[target.branch], target.position(self._anatomy)
+        nearest, found = int(np.abs(branch.centerline.abscissa - target.abscissa).argmin()), []
+        place = {
+            "position": position.round(3).tolist(),
+            "branch": target.branch,
+            "abscissa": round(target.abscissa, 2),
+            "section": self._anatomy.tree.section_names[int(branch.section[nearest])],
+        }
         for angles, factor in self.settings.planes:
             view = view_at(angles, self.imager.isocenter, self.imager.config.geometry)
-            right, up = factor * view.project(point)
+            right, up = factor * view.project(position)
             middle = (self.imager.config.pixels - 1) / 2
             found.append([round(middle + float(right), 1), round(middle - float(up), 1)])
-        return found
+        return {"xray": self.values(now_s), "target": place, "target_px": found}
 
     def close(self) -> None:
         """Stop computing."""

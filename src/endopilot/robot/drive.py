@@ -58,9 +58,10 @@ _NUMBER = re.compile(
 
 
 class Drive:
-    """The machine: motion, watchdog, and who may command (`owner`). `stopped` is why it stands still, or None while it
-    is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked"; `dropped`
-    counts commands whose ticket was too old, void or never given; `news` are lines for people, who take them out."""
+    """The machine: motion, watchdog, and its client, if one has `taken` it. `stopped` is why it stands still, or None
+    while it is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked";
+    `dropped` counts commands whose ticket was too old, void or never given; `news` are lines for people, who take them
+    out."""
 
     def __init__(
         self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
@@ -78,7 +79,7 @@ class Drive:
         self._state: str | None = None
         self.stopped: str | None = "start"
         self.dropped = 0
-        self.owner: Session | None = None
+        self.taken, self._held = False, b""
         self.news: deque[str] = deque(maxlen=_MOST_NEWS)
 
     @property
@@ -145,12 +146,49 @@ class Drive:
             self._state = f"STATE {read} {status} {self._ticket()}\n"
         return self._state
 
-    def open(self) -> Session:
-        """Return the drive's side of a new connection; there is one at a time, the `owner`."""
-        assert self.owner is None
-        self.owner = Session(self)
+    def open(self) -> None:
+        """Take a client, of which there is one at a time."""
+        assert not self.taken
+        self.taken, self._held = True, b""
         self.news.append("a client is connected")
-        return self.owner
+
+    def receive(self, data: bytes, now: float) -> bytes | None:
+        """Take bytes of the client as they came, cut anywhere, and return an answer for each line that they end; None
+        for a line that never ends, after which the connection is to be closed."""
+        self.tick(now)
+        *lines, self._held = (self._held + data).split(b"\n")
+        answers = [self._answer(line) for line in lines]
+        if len(self._held) >= LONGEST_LINE:
+            self.stop("malformed")
+            return None
+        return "".join(answers).encode("ascii")
+
+    def close(self, now: float) -> None:
+        """Note that the client's connection is closed, at a time by the drive's clock, s; the drive stops."""
+        self.tick(now)
+        self.stop("connection")
+        self.taken = False
+        self.news.append("the client has disconnected")
+
+    def _answer(self, line: bytes) -> str:
+        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
+        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
+        match text.split(" "):
+            case ["STATE"]:
+                pass
+            case ["STOP"]:
+                self.stop("asked")
+            case ["ARM", ticket]:
+                self.arm(ticket)
+            case ["MOVE", ticket, first, second]:
+                translation, rotation = number(first), number(second)
+                if translation is None or rotation is None:
+                    self.stop("malformed")
+                else:
+                    self.move(ticket, translation, rotation)
+            case _:
+                self.stop("malformed")
+        return self.state()
 
     @property
     def greeting(self) -> str:
@@ -185,57 +223,6 @@ class Drive:
         (low, high), at, speed = self._limits.travel_mm, self.position[0], self._motion.velocity[0, 0, 0]
         if self.stopped is None and ((at <= low and speed < 0) or (at >= high and speed > 0)):
             self.stop("travel")
-
-
-class Session:
-    """The drive's side of the connection of its owner."""
-
-    def __init__(self, drive: Drive) -> None:
-        """Wait for the first line."""
-        self._drive, self._held, self.closed = drive, b"", False
-
-    def receive(self, data: bytes, now: float) -> bytes:
-        """Take bytes as they came, cut anywhere, and return an answer for each line that they end; a line that never
-        ends closes the session."""
-        self._drive.tick(now)
-        if self.closed:
-            return b""
-        *lines, self._held = (self._held + data).split(b"\n")
-        answers = [self._answer(line) for line in lines]
-        if len(self._held) >= LONGEST_LINE:
-            self._drive.stop("malformed")
-            self.close(now)
-        return "".join(answers).encode("ascii")
-
-    def close(self, now: float) -> None:
-        """Note that the connection is closed, at a time by the drive's clock, s; the drive stops."""
-        self._drive.tick(now)
-        self.closed, self._held = True, b""
-        if self._drive.owner is self:
-            self._drive.stop("connection")
-            self._drive.owner = None
-            self._drive.news.append("the client has disconnected")
-
-    def _answer(self, line: bytes) -> str:
-        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
-        drive = self._drive
-        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
-        match text.split(" "):
-            case ["STATE"]:
-                pass
-            case ["STOP"]:
-                drive.stop("asked")
-            case ["ARM", ticket]:
-                drive.arm(ticket)
-            case ["MOVE", ticket, first, second]:
-                translation, rotation = number(first), number(second)
-                if translation is None or rotation is None:
-                    drive.stop("malformed")
-                else:
-                    drive.move(ticket, translation, rotation)
-            case _:
-                drive.stop("malformed")
-        return drive.state()
 
 
 def number(text: str) -> float | None:
@@ -289,11 +276,11 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
     is cancelled; `say` is called with each line for people. InputError where the address cannot be listened on."""
 
     async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if drive.owner is None:
-            await _obey(drive, reader, writer)
-        else:
+        if drive.taken:
             writer.write(f"{PROTOCOL} BUSY\n".encode("ascii"))
             writer.close()
+        else:
+            await _obey(drive, reader, writer)
 
     terminated = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
@@ -324,7 +311,8 @@ def _listen(host: str, port: int) -> socket.socket:
 
 async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Answer the lines of a client that showed its certificate, until it is gone; then the drive stops."""
-    session, why = drive.open(), ""
+    drive.open()
+    why = ""
     writer.write(drive.greeting.encode("ascii"))
     try:
         while not why:
@@ -332,9 +320,10 @@ async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.Stre
                 data = await reader.read(READ_BYTES)
             if not data:
                 break
-            writer.write(session.receive(data, time.monotonic()))
+            answers = drive.receive(data, time.monotonic())
+            writer.write(answers or b"")
             await asyncio.sleep(0)  # what a client sends at once holds nobody up
-            if session.closed:
+            if answers is None:
                 why = "a line of it has no end"
             elif writer.transport.get_write_buffer_size() > MOST_UNREAD:
                 why = "it does not read the answers"
@@ -346,4 +335,4 @@ async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.Stre
         if why:
             drive.news.append(f"the client is sent away: {why}")
         writer.transport.abort()
-        session.close(time.monotonic())
+        drive.close(time.monotonic())
