@@ -206,6 +206,7 @@ def test_what_is_no_number_not_finite_or_beyond_the_limits_stops_it(arguments, r
     assert rest(drive, 1.0) == pytest.approx(at + 0.0625, abs=0.02)
 
 
+@settings(deadline=None)
 @given(some.floats())
 def test_numbers_are_read_as_they_are_written(value) -> None:
     np.testing.assert_array_equal(number(repr(value)), value)

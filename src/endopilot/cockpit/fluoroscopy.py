@@ -28,15 +28,9 @@ _NICE = 10  # of the thread that computes views: the wire goes first
 
 @dataclass(frozen=True)
 class XraySettings:
-    """How the C-arm stands and what its pedal does.
-
-    Attributes:
-        angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, of each plane, degrees.
-        biplane: two planes, or the first alone.
-        frames_per_s: pulses of fluoroscopy, 1/s.
-        dose: of a frame, as a multiple of the usual one.
-        roadmap: lay the vessel of the last injection under the live image.
-    """
+    """How the C-arm stands, LAO (positive) or RAO, and cranial (positive) or caudal, degrees, of two planes or the
+    first alone, and what its pedal does: pulses a second, each of a multiple of the usual dose, and whether the vessel
+    of the last injection lies under the live image."""
 
     angles_deg: tuple[tuple[float, float], tuple[float, float]] = ((-30.0, 0.0), (60.0, 0.0))
     zoom: float = 1.0
@@ -52,13 +46,9 @@ class XraySettings:
 
 
 class XrayUnit:
-    """C-arm, pedal and contrast of one patient; `configure` changes its settings.
-
-    Attributes:
-        frames: exposures so far, of both planes together as one; `seconds` of fluoroscopy, s.
-        kerma_ugy: air kerma at the patient's entrance reference point so far, both planes, µGy.
-        background: what the patient looks like: "CT", "phantom", or "plain" water.
-    """
+    """C-arm, pedal and contrast of one patient, who looks like "CT", "phantom", or "plain" water. So far there were
+    `frames`, of both planes together as one, `seconds` of fluoroscopy, and `kerma_ugy`, the air kerma at the patient's
+    entrance reference point of both planes, µGy."""
 
     def __init__(
         self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None

@@ -123,18 +123,9 @@ def calibrate(
     robot: RobotConfig | None = None,
     config: CalibrateConfig | None = None,
 ) -> RobotCalibration:
-    """Calibrate a robot and its wire.
-
-    Args:
-        logs: what the robot was asked for, and what was seen.
-        anatomy: the vessel that it was driven through.
-        device: the wire, as it is known.
-        robot: what is known of the robot; the fields that are found are replaced.
-        config: how they are fitted.
-
-    Raises:
-        InputError: too few episodes; an axis is counted the other way round, or in another unit.
-    """
+    """Calibrate a robot and its wire, as they are known, by logs of driving the wire through a vessel; the fields that
+    are found are replaced. InputError for too few episodes, or an axis counted the other way round, or in another
+    unit."""
     config, robot = config or CalibrateConfig(), robot or RobotConfig()
     episodes = usable_episodes(logs, anatomy)
     if len(episodes) < LEAST_EPISODES:

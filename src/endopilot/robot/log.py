@@ -41,20 +41,11 @@ _BESIDE_MM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """What a robot was asked for, and what was seen of its wire. NaN where a row says nothing.
+    """What a robot was asked for, and what was seen of its wire, a row for each moment; NaN where it says nothing.
 
-    Attributes:
-        name: of the log.
-        time_s: of each row, s.
-        episode: number of the episode that each row belongs to.
-        command: positions that the drives were sent to, mm and rad, of each device.
-        encoders: what encoders read, mm and rad.
-        load: force (N) and torque (N·mm) of the drives.
-        tip: the wire's tip as it was seen, LPS mm; from a pixel once the vessel is known (`in_vessel`).
-        pixel: column and row that showed it.
-        used: whether what was seen is to be used.
-        camera: what pixels belong to; None where tips were seen in space.
-        by_velocity: whether the drives were sent along by velocity, and `command` is what these sum up to.
+    The command is where the drive of each device was sent to, mm and rad, or, `by_velocity`, what its velocities sum up
+    to; encoders read mm and rad, loads are N and N·mm. The wire's tip was seen in space, LPS mm, or by a camera as a
+    pixel, column and row, and in space once the vessel is known (`in_vessel`); `used` says whether that counts.
     """
 
     name: str

@@ -68,14 +68,10 @@ class ReplayConfig:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeReplay:
-    """One episode, seen and simulated.
+    """One episode, seen and simulated: at the times at which the tip was seen, by the log's clock, s, the real tip and the
+    simulated one, LPS mm, with their branches. Those that are `given` say where the wire lies; others are predicted.
 
     Attributes:
-        number: of the episode in its log.
-        time_s: at which the tip was seen, by the log's clock, s.
-        given: which of the tips say where the wire lies; the others were predicted.
-        seen: the real tip, LPS mm.
-        simulated: the simulated tip at the same times, LPS mm.
         predicted: where the tip is expected, LPS mm: beside where kinematics lead it in the simulated tip's branch, or
             beside the simulated tip, by what tips before were; as simulated while given.
         abscissa: Δtip of both, seen and simulated, mm.
@@ -83,7 +79,6 @@ class EpisodeReplay:
         in_view: the difference of the predicted tip from the real one, as the camera sees it, mm.
         core_mm: distance of the simulated tip from the real one, likewise.
         along: unit vector along the vessel at the real tip.
-        branch: of both tips.
         force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
         rotation_rad: φ that the simulated wire began with.
         rotation_known_rad: rotations no farther from it than this are as good, as what was given tells; NaN where it
@@ -160,18 +155,8 @@ def replay_log(
     robot: RobotConfig,
     config: ReplayConfig | None = None,
 ) -> list[EpisodeReplay]:
-    """Replay logs.
-
-    Args:
-        logs: what a robot was asked for, and what was seen.
-        anatomy: the vessel.
-        device: the wire.
-        robot: latency, gains and plays of the drive.
-        config: what is given, and which starts are tried.
-
-    Raises:
-        InputError: no episode shows the tip often enough.
-    """
+    """Replay logs: what a robot, by its latency, gains and plays, makes of their commands with a wire in a vessel;
+    InputError where no episode shows the tip often enough."""
     config = config or ReplayConfig()
     prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given, robot)
     return replay_prepared(prepared, device, robot, config)

@@ -64,16 +64,9 @@ class SimulatedRobot:
         backs_out: tuple[float, float] = (0.0, 0.0),
         cycle_s: float = CYCLE_S,
     ) -> None:
-        """Grasp the devices where they are.
-
-        Args:
-            simulator: of one world, driven by velocity.
-            limits: of the drive of the wire, then of each catheter's.
-            config: latency, gains, plays, encoders and noise, drawn by `seed`.
-            ostium_mm: the true inserted lengths are this much more than the encoders', mm.
-            backs_out: after how many seconds the guiding catheter backs out of the ostium, and by how much, mm.
-            cycle_s: period of the drives' loop, s.
-        """
+        """Grasp the devices of a simulator's one world, driven by velocity, with drives of some limits, the wire's
+        first, and gains, jitter and noise that `seed` draws. True inserted lengths are `ostium_mm` more than the
+        encoders'; the guiding catheter `backs_out` of the ostium after some seconds, by some mm."""
         self._simulator, self._limits, self._random = simulator, tuple(limits), np.random.default_rng([seed, 1])
         counted = [limit.by_encoder(ostium_mm) for limit in limits]
         self._robots = Robots(simulator, config or RobotConfig(), [counted], seeds=[[seed]], ostium_mm=ostium_mm)
