@@ -85,6 +85,7 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
         ("dataset", "missing", "-o", "out"),
         ("train", "missing", "-o", "out"),
         ("evaluate", "missing", "-o", "out"),
+        ("replay", "missing.csv", "--anatomy", "missing", "-o", "out"),
     ],
 )
 def test_a_missing_input_is_reported_in_one_line(

@@ -68,8 +68,8 @@ class ReplayConfig:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeReplay:
-    """One episode, seen and simulated: at the times at which the tip was seen, by the log's clock, s, the real tip and the
-    simulated one, LPS mm, with their branches. Those that are `given` say where the wire lies; others are predicted.
+    """One episode, seen and simulated: when the tip was seen, by the log's clock, s, where it was and where the
+    simulated one was, LPS mm, with their branches. Tips that are `given` say where the wire lies, others are predicted.
 
     Attributes:
         predicted: where the tip is expected, LPS mm: beside where kinematics lead it in the simulated tip's branch, or
