@@ -61,12 +61,12 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys,
     monkeypatch.setattr(study, "TrainConfig", partial(TrainConfig, epochs=3))  # each checks and writes the networks
     before = masks(case)
     assert before and not (case / "run" / "report.html").exists()
-    line = (*arguments(case), "--target", "1")  # none was given before
+    line = (*arguments(case), "--target", "2")  # none was given before
     found = command.run(capsys, *line)
     assert masks(case) == before  # finished work is not done twice
 
-    assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 1 at ")
-    assert found["page"] == str(case / "run" / "navigation" / "1" / "navigation.html")
+    assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
+    assert found["page"] == str(case / "run" / "navigation" / "2" / "navigation.html")
     assert found["report"] == str(case / "run" / "report.html") and found["rejected"] == {}
     page = (case / "run" / "report.html").read_text(encoding="utf-8")
     for part in ("data:image/png;base64,", "Plotly.newPlot", "One CT angiogram, given by the user", "Kim et al. 2023"):
@@ -112,7 +112,7 @@ def tiny_ct(seed: int) -> Volume:
     return Volume(voxels, np.ones(3), np.zeros(3), np.eye(3))
 
 
-OF_DEMO = ("--patients", "3", "--sequences", "1", "--seconds", "10")
+OF_DEMO = ("--patients", "3", "--sequences", "1", "--seconds", "20")
 DEMO_STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 

@@ -132,7 +132,7 @@ def test_the_public_logs_have_the_play_that_was_measured_on_them(tmp_path) -> No
 
     phantom = endopilot.extract_anatomy(next(folder.glob("phantom2d*.vtp")), config=endopilot.AnatomyConfig(scale=1.0))
     logs = [convert(path, tmp_path) for path in sorted(folder.glob("2D_phantom_Mid_M1*.csv"))]
-    found = calibrate(logs, phantom, endopilot.read_wire("workhorse-014"), config=CalibrateConfig(wires=0, episodes=8))
+    found = calibrate(logs, phantom, endopilot.read_wire("workhorse-014"), config=CalibrateConfig(wires=0, episodes=12))
     assert abs(found.robot.wire.gain_translation - 1.01) < 0.03
     assert abs(found.robot.wire.play_mm - 3.0) < 0.3
     assert np.median([each.errors["along"] for each in found.replays]) < 0.35
