@@ -96,7 +96,7 @@ class RobotCalibration:
         wire: with the constants of the best candidate, which belong together, identified or not; as it was known where
             the layer was left out.
         estimates: each constant with its interval.
-        layers: what slip, the simulated wire's slack and the wire gained on episodes left out, if they were not.
+        layers: what slip, a simulated wire's slack and the wire gained on episodes left out, or that it was left out.
         band_mm: half-width within which Δtip is predicted throughout nine of ten episodes of another session (log), mm,
             by the drive alone where the slack was left out; None with too few sessions.
         next_band_mm: the same of one more episode of these sessions, mm; None with too few episodes.
