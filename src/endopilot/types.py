@@ -51,16 +51,10 @@ side. In atlas patients of all kinds it lies off by 0.12 at least (0.2 to 0.8 in
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """A three-dimensional image: CT numbers in HU, or a mask.
-
-    Attributes:
-        voxels: values, indexed [k, j, i].
-        spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
-        origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
-        direction: columns are the LPS unit vectors along which i, j and k grow.
-        notes: what reading it changed or had to decide, a sentence each.
-        files: the files that it was read from; none where it was made.
-    """
+    """A three-dimensional image: CT numbers in HU, or a mask, indexed [k, j, i]. `spacing_mm` lies between voxel
+    centres along i, j and k, whose LPS unit vectors are the columns of `direction`; `origin_mm` is the LPS position of
+    the centre of voxel (0, 0, 0). `notes` say what reading it from `files` changed or had to decide, a sentence
+    each."""
 
     voxels: Shaped[np.ndarray, "nz ny nx"]
     spacing_mm: Float[np.ndarray, "3"]
@@ -98,14 +92,9 @@ class Insertion:
 
 @dataclass(frozen=True, eq=False)
 class LumenMask:
-    """The segmented inside of one vessel tree.
-
-    Attributes:
-        volume: boolean voxels, true inside the lumen.
-        ostium: where the device enters, if the segmentation found it or the user gave it.
-        method: name of the segmentation method, or where the mask came from.
-        warnings: what reading the CT or the mask changed, and what the segmentation doubts, a sentence each.
-    """
+    """The segmented inside of one vessel tree: boolean voxels, true inside the lumen, where the device enters, if that
+    was found or given, and the name of the segmentation method, or where the mask came from. `warnings` say what
+    reading the CT or the mask changed, and what the segmentation doubts, a sentence each."""
 
     volume: Volume
     ostium: Insertion | None = None
@@ -127,14 +116,9 @@ class LumenMask:
 
 @dataclass(frozen=True, eq=False)
 class Centerline:
-    """One unbranched line through a vessel, from the ostium outwards.
-
-    Attributes:
-        points: positions, LPS mm.
-        radius: radius of the largest sphere centred at each point that fits in the lumen, mm.
-        abscissa: distance from the ostium along the line, mm, increasing.
-        normals: unit vectors perpendicular to the line, carried along it without twist (parallel transport).
-    """
+    """One unbranched line through a vessel, from the ostium outwards: points, LPS mm, the radius of the largest sphere
+    around each that fits in the lumen, mm, the distance from the ostium along the line, mm, and unit vectors
+    perpendicular to the line, carried along it without twist (parallel transport)."""
 
     points: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, "n"]
@@ -245,14 +229,9 @@ class VesselTree:
 
 @dataclass(frozen=True, eq=False)
 class DistanceMap:
-    """Signed distance to the vessel wall on a regular grid along the LPS axes.
-
-    Attributes:
-        values: distance to the wall, mm, positive inside, indexed [k, j, i] along z, y, x; it is cut off at a fixed
-            negative value outside. The guiding catheter that ends at the ostium counts as inside.
-        spacing_mm: distance between grid points, mm, the same along the three axes.
-        origin_mm: LPS position of `values[0, 0, 0]`, mm.
-    """
+    """Distance to the vessel wall, mm, positive inside, on a grid along the LPS axes, indexed [k, j, i] along z, y, x,
+    of one spacing and from the LPS position of `values[0, 0, 0]` on, mm. It is cut off at a fixed negative value
+    outside; the guiding catheter that ends at the ostium counts as inside."""
 
     values: Float[np.ndarray, "nz ny nx"]
     spacing_mm: float
@@ -261,16 +240,9 @@ class DistanceMap:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """One patient's vessel, ready for simulation.
-
-    Attributes:
-        name: short name, unique within a study; it names the patient in datasets and reports.
-        tree: centerline with branches and section labels.
-        distance_map: signed distance to the wall, guiding catheter included.
-        insertion: the ostium, the catheter's axis and φ's zero.
-        catheter_radius_mm: inner radius of the guiding catheter's tube in the distance map, mm.
-        provenance: what the anatomy was made from, and how (written to `anatomy.json`).
-    """
+    """One patient's vessel, ready for simulation: a name, unique within a study, the centerline with branches and
+    section labels, the distance to the wall, the ostium with the catheter's axis and φ's zero, the inner radius of the
+    guiding catheter in the distance map, mm, and what it was made from, and how (written to `anatomy.json`)."""
 
     name: str
     tree: VesselTree
@@ -290,16 +262,9 @@ class Anatomy:
         return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
 
     def target(self, place: Place, *, depth_mm: float | None = None) -> Target:
-        """Return the target that is meant, as navigations, environments and commands understand it.
-
-        Args:
-            place: a section such as "4" or "LAD", whose middle is meant; a point X, Y, Z in LPS mm, which is moved to
-                the centerline; or a target, which is checked.
-            depth_mm: the place so far beyond the section's begin is meant, mm.
-
-        Raises:
-            InputError: nothing is named, or what does not lie in the vessel.
-        """
+        """Return the target that is meant, as navigations, environments and commands understand it: the middle of a
+        section such as "4" or "LAD", or the place `depth_mm` beyond its begin; a point X, Y, Z in LPS mm, moved to the
+        centerline; or a target, which is checked. InputError where that names nothing, or what is not in the vessel."""
         find_target = import_module("endopilot.tasks.targets").find_target  # by name: this module imports no room
         return find_target(self.tree, place, depth_mm=depth_mm)
 

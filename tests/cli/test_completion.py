@@ -6,17 +6,9 @@ import sys
 
 import pytest
 
+from endopilot.cli import main
+
 ASK = 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _endopilot; echo "${COMPREPLY[@]}"'
-
-
-@pytest.fixture(scope="module")
-def script(tmp_path_factory):
-    made = subprocess.run(
-        [sys.executable, "-m", "endopilot.cli", "completion"], capture_output=True, text=True, check=True
-    ).stdout
-    file = tmp_path_factory.mktemp("completion") / "script"
-    file.write_text(made)
-    return file
 
 
 @pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
@@ -27,15 +19,15 @@ def test_tab_completes_in_fish():
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
+def test_tab_completes(capsys, tmp_path):
+    with pytest.raises(SystemExit, match="0"):
+        main(["completion"])
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    for words, completed in (
         (["endopilot", "na"], "navigate"),
         (["endopilot", "navigate", "patient", "--tar"], "--target"),
         (["endopilot", "xray", "--show", ""], "fluoroscopy contrast dsa roadmap"),
         (["endopilot", "navigate", "pat"], ""),  # bash goes on with files
-    ],
-)
-def test_tab_completes(script, words, completed):
-    made = subprocess.run(["bash", "-c", ASK, script, *words], capture_output=True, text=True, check=True)
-    assert made.stdout.strip() == completed
+    ):
+        line = ["bash", "-c", ASK, tmp_path / "script", *words]
+        assert subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip() == completed

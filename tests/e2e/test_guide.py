@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -54,18 +53,16 @@ def test_all_pages_are_walked() -> None:
     assert {page.name for page in PAGES} | {"index.md"} == {page.name for page in (ROOT / "docs/guide").glob("*.md")}
 
 
-FOLDER = Path(__file__).parents[2] / "examples"
+FOLDER = ROOT / "examples"
 NEEDS_MORE = {"offline_sets.py", "recurrent_ppo.py", "robot_bag.py", "segment_wire.py", "train_sb3.py"}
 """Examples that train for minutes, or need data or a library of their own."""
 EXAMPLES = sorted(path.name for path in FOLDER.glob("*.py") if path.name not in NEEDS_MORE)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_runs_and_its_assertion_holds(name, tmp_path):
-    assert "    assert " in (FOLDER / name).read_text(encoding="utf-8")
-    done = subprocess.run([sys.executable, FOLDER / name], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-
-
-def test_there_are_examples():
-    assert {"my_policy.py", "my_segmentation.py", "robot_phantom_logs.py"} <= set(EXAMPLES)
+def test_an_example_runs_and_its_assertion_holds(name, tmp_path, monkeypatch):
+    assert "    assert " in (FOLDER / name).read_text(encoding="utf-8") and len(EXAMPLES) > 5
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(FOLDER)
+    monkeypatch.setattr(sys, "argv", [name])
+    runpy.run_path(str(FOLDER / name), run_name="__main__")

@@ -1,4 +1,4 @@
-"""`endopilot run` and `endopilot demo`: killed and begun again, they end with a report."""
+"""`endopilot run`, killed and begun again, and `endopilot demo` end with a report."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ import numpy as np
 import pydicom
 import pytest
 
-from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
-from endopilot.imaging.volume import read_mask, write_volume
+from endopilot.imaging.volume import write_volume
 from endopilot.models.config import TrainConfig
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline import study
@@ -58,22 +57,16 @@ def masks(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in (folder / "run" / "masks").glob("[!.]*.nii.gz")}
 
 
-@pytest.fixture
-def made_before(case, monkeypatch):
-    """Let a run take mask and anatomy of the same CT from the run before: no other settings are used for them here."""
-    mask, anatomy = case / "run" / "masks" / "patient.nii.gz", case / "run" / "anatomies" / "patient"
-    monkeypatch.setattr(study, "segment", lambda volume, config: read_mask(mask))
-    if anatomy.exists():
-        monkeypatch.setattr(study, "extract_anatomy", lambda source, name, config: read_anatomy(anatomy))
-
-
 def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys, monkeypatch):
     monkeypatch.setattr(study, "TrainConfig", partial(TrainConfig, epochs=3))  # each checks and writes the networks
     before = masks(case)
     assert before and not (case / "run" / "report.html").exists()
-    found = command.run(capsys, *arguments(case))
+    line = (*arguments(case), "--target", "2")  # none was given before
+    found = command.run(capsys, *line)
     assert masks(case) == before  # finished work is not done twice
 
+    assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
+    assert found["page"] == str(case / "run" / "navigation" / "2" / "navigation.html")
     assert found["report"] == str(case / "run" / "report.html") and found["rejected"] == {}
     page = (case / "run" / "report.html").read_text(encoding="utf-8")
     for part in ("data:image/png;base64,", "Plotly.newPlot", "One CT angiogram, given by the user", "Kim et al. 2023"):
@@ -85,37 +78,17 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys,
     assert [path for path in case.rglob("*") if path.name.startswith(".part")] == []
 
     written = {path: path.stat().st_mtime_ns for path in case.rglob("*")}
-    assert command.run(capsys, *arguments(case)) == found
+    assert command.run(capsys, *line) == found
+    assert "has no such section" in command.refused(capsys, *arguments(case), "--target", "LADX")
     assert {path: path.stat().st_mtime_ns for path in case.rglob("*")} == written
 
 
-def test_a_target_is_driven_to_with_simulated_wires_beside(case, made_before, tmp_path, capsys):
-    line = ("run", case / "ct.nii.gz", "-o", tmp_path / "run", "--sequences", "1", "--seconds", "20")
-    found = command.run(capsys, *line, "--target", "2")
-    assert list(found)[:2] == ["outcome", "page"] and found["outcome"].startswith("reached section 2 at ")
-    assert found["page"] == str(tmp_path / "run" / "navigation" / "2" / "navigation.html")
-    manifest, metrics = (read_json(tmp_path / "run" / f"{name}.json") for name in ("manifest", "metrics"))
-    assert list(manifest["stages"]) == [stage for stage in STAGES if stage != "training"]
-    assert list(metrics["splits"]) == ["test"]  # to simulated wires every patient is new
-
-    again = command.run(capsys, *line, "--target", "1")  # another target, in the same folder
-    assert again["report"] == found["report"] and again["page"] != found["page"]
-    assert "has no such section" in command.refused(capsys, *line, "--target", "LADX")
-    assert sorted(path.name for path in (tmp_path / "run" / "navigation").iterdir()) == ["1", "2"]
-
-
-@pytest.fixture
-def untouched(case):
-    """Check that a test left the run as it was."""
+def test_another_patient_is_refused_though_the_file_s_name_is_the_same(case, tmp_path, capsys):
     before = {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")}
-    yield
-    assert {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")} == before
-
-
-def test_another_patient_is_refused_though_the_file_s_name_is_the_same(case, untouched, tmp_path, capsys):
     write_volume(tiny_ct(2), tmp_path / "ct.nii.gz")
     line = command.refused(capsys, *arguments(case, tmp_path / "ct.nii.gz"))
     assert f"{case / 'run'}: was begun with volume_sha256 = " in line
+    assert {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")} == before
 
 
 def test_another_series_is_refused(tmp_path, capsys):
@@ -143,23 +116,11 @@ OF_DEMO = ("--patients", "3", "--sequences", "1", "--seconds", "20")
 DEMO_STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
-def test_killed_and_started_again_it_ends_with_a_report(tmp_path, capsys, monkeypatch):
+def test_a_demo_ends_with_a_report_and_is_then_left_alone(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "demo"
-    line = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(folder), *OF_DEMO]
-    with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
-        deadline = time.monotonic() + 300
-        while not (folder / "stages.json").exists():  # written as the first stage ends
-            assert first.poll() is None and time.monotonic() < deadline
-            time.sleep(0.1)
-        time.sleep(0.5)  # in the midst of the second
-        first.send_signal(signal.SIGKILL)
-    assert not (folder / "report.html").exists()
-    before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
-
     small = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)  # seen sooner
     monkeypatch.setattr(study, "PhantomConfig", small)
     again = command.run(capsys, "demo", "-o", folder, *OF_DEMO)
-    assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
     report = (folder / "report.html").read_text(encoding="utf-8")
     for part in ("data:image/png;base64,", "Plotly.newPlot", "Kim et al. 2023", "Safety ratio", "patient-3"):

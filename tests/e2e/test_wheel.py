@@ -1,7 +1,7 @@
 """The sdist holds the whole package; what `make release` builds of it does what the base install promises.
 
-Wheels are tried where `make release` has built them: `make test` builds the sdist alone, and test_plugins.py hides all
-libraries but the base ones instead of installing these.
+Wheels are tried where `make release` has built them: `make test` builds the sdist alone, and tests/cli/test_bare.py
+hides the libraries of all extras instead of installing the base ones.
 """
 
 from __future__ import annotations

@@ -65,15 +65,14 @@ def spies(tmp_path, monkeypatch):
 
 
 def test_a_policy_from_a_file_is_run_in_patients_that_its_request_draws(spies, tmp_path):
-    config = LadderConfig(policy=f"{spies}:Spy", tasks=("straight",), patients=2, drawn="commit 1f3a")
+    config = LadderConfig(policy=f"{spies}:Spy", tasks=("straight",), patients=1, drawn="commit 1f3a")
     (row,) = climb(output=tmp_path / "run", config=config)
     assert row["exposures"] > 2 and row["safe_success"] == 1.0
     content = json.loads((tmp_path / "run" / "submission.json").read_text(encoding="utf-8"))
     done, usual = content["navigations"]["straight"], find_task("straight").ladder
     drawn = terms_of(config).task("straight").ladder
-    assert [entry["reason"] for entry in done] == ["reached", "reached"]  # it saw no world
-    assert [entry["seed"] for entry in done] == [drawn.seed, drawn.seed + 1] and drawn.seed != usual.seed
-    assert len({entry["patient"] for entry in done}) == 2
+    assert [entry["reason"] for entry in done] == ["reached"]  # it saw no world
+    assert [entry["seed"] for entry in done] == [drawn.seed] and drawn.seed != usual.seed
     found = check_submission(tmp_path / "run" / "submission.json")
     assert found.verdict == "replayed" and found.key["split"] == "test" and found.key != Terms().key()
     checked = runpy.run_path(str(LEADERBOARD))["checked"]

@@ -14,7 +14,6 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
-from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
@@ -41,9 +40,9 @@ class Hurried:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> dict:
-    """Return the content of the submission of `forward` in the first patient of two tasks."""
+    """Return the content of the submission of `forward` in the first patient of a task."""
     folder = tmp_path_factory.mktemp("submission")
-    climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight", "descending"), patients=1))
+    climb(output=folder, config=LadderConfig(policy="forward", tasks=("straight",), patients=1))
     return json.loads((folder / "submission.json").read_text(encoding="utf-8"))
 
 
@@ -80,19 +79,6 @@ def _record(content: dict, change) -> None:
     entry["recording"] = Recording(control, exposed, None).packed()
 
 
-def _at(row: int, column: int, factor: float):
-    def change(control, exposed):
-        control[row, 0, column] = control[row, 0, column] * factor + (factor - 1)
-        return control, exposed
-
-    return change
-
-
-def _swap_exposures(control, exposed):
-    exposed[3] = True
-    return control, exposed
-
-
 def _too_fast(content: dict) -> dict:
     """Return a navigation whose drive is commanded more than it does, with the hash of that."""
     was, navigation = Recording.unpacked(_first(content)["recording"]), find_task("straight").ladder_navigation(0)
@@ -103,12 +89,12 @@ def _too_fast(content: dict) -> dict:
     return {name: value for name, value in forged.items() if name != "course"}
 
 
-def test_a_submission_is_confirmed_in_other_processes(written, check, in_processes):
+def test_a_submission_is_confirmed(written, check):
     found = check(written)
-    assert (found.verdict, found.difference, found.navigations, found.remarks) == ("decided again", None, 2, ())
+    assert (found.verdict, found.difference, found.navigations, found.remarks) == ("decided again", None, 1, ())
     assert [submitted(row) for row in found.scores] == written["scores"]  # as they were driven again
     assert found.policy == "forward" and found.origin.startswith("endopilot ")
-    assert {row["task"] for row in written["scores"]} == {"straight", "descending"}
+    assert [row["task"] for row in written["scores"]] == ["straight"]
 
 
 def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path):
@@ -135,15 +121,10 @@ def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
     ("change", "difference"),
     [
         (lambda c: _first(c).update(peak_force_n=0.0123), "peak_force_n is 0.0123 in the file and 0."),
-        (lambda c: _first(c).update(path_ratio=np.nextafter(_first(c)["path_ratio"], 2)), "path_ratio is "),
-        (lambda c: _first(c).update(exposures=0), "exposures is 0 in the file and 1 when driven again"),
-        (lambda c: _first(c).update(success=False), "success is false in the file and true"),
         (lambda c: _first(c).update(patient="nobody"), 'patient is "nobody" in the file'),
-        (lambda c: _first(c).update(events=[3, 0]), "events is "),
         (lambda c: _first(c).update(sha256="0" * 64), "decisions or course are not those"),
-        (lambda c: _record(c, _at(4, 0, 1 + 1e-12)), ""),
-        (lambda c: _record(c, _at(4, 1, 1 + 1e-12)), ""),
-        (lambda c: _record(c, _swap_exposures), "exposures is 1 in the file and 2"),
+        (lambda c: _record(c, lambda v, x: (v * (1 + 1e-12), x)), ""),
+        (lambda c: _record(c, lambda v, x: (v, x | (np.arange(len(x)) == 3))), "exposures is 1 in the file and 2"),
         (lambda c: _record(c, lambda v, x: (v[:-1], x[:-1])), "decisions, and the navigation goes on"),
         (lambda c: _record(c, lambda v, x: (np.vstack([v, v]), np.hstack([x, x]))), "and the navigation ends after"),
         (lambda c: _record(c, lambda v, x: (v, ~x)), "X-ray is off at the first decision"),
@@ -154,23 +135,22 @@ def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
 def test_a_changed_navigation_is_named(changed, change, difference):
     found = changed(change).difference
     assert found.startswith("task straight, patient 0: ") and difference in found
-    assert found.endswith("(1 of 2 navigations differ)")
+    assert found.endswith("(1 of 1 navigations differ)")
 
 
-def test_the_first_of_several_navigations_is_named_by_level(changed):
+def test_the_first_of_several_navigations_is_named_by_level(looking, check):
     def both(content):
         content["navigations"] = dict(reversed(content["navigations"].items()))
         for done in content["navigations"].values():
             done[0]["seconds"] += 0.5
 
-    found = changed(both).difference
+    found = check(looking, both).difference
     assert found.startswith("task straight, patient 0: seconds is") and found.endswith("(2 of 2 navigations differ)")
 
 
 def test_a_changed_score_is_named(changed):
-    assert (
-        "scores, descending: safe_success is " in changed(lambda c: c["scores"][1].update(safe_success=0.5)).difference
-    )
+    found = changed(lambda c: c["scores"][0].update(safe_success=0.5)).difference
+    assert "scores, straight: safe_success is " in found
     more = {"level": None, "task": "all twelve", "safe_success": 1.0}
     assert "scores, all twelve: level is null" in changed(lambda c: c["scores"].append(more)).difference
 
@@ -185,7 +165,6 @@ def test_a_changed_score_is_named(changed):
             lambda c: [of.update(moon=of.pop("straight")) for of in (c["tasks"], c["navigations"])],
             "task: 'moon'; choose",
         ),
-        (lambda c: c["navigations"]["straight"].append(_first(c)), "needs the same first 1 to 20 patients"),
         (lambda c: c.update(format=2), "format: 2; choose from 1, or give a submission.json"),
         (lambda c: c.update(extra=1), "extra: no such field; the fields are format"),
         (lambda c: c.pop("policy"), "policy: missing; add it"),
@@ -250,11 +229,6 @@ def _of_a_better_hand(content: dict) -> None:
     _again(content, lambda was: replace(was, control=was.control * [1.0 + 1e-9, 1.0]))
 
 
-def _of_another_version(content: dict) -> None:
-    content["origin"] = "endopilot 0.0.1"
-    _without_exposures(content)
-
-
 def _left_out(content: dict) -> None:
     for of in (content["tasks"], content["navigations"]):
         del of["descending"]
@@ -286,19 +260,16 @@ def looking(tmp_path_factory) -> dict:
     [
         (_made_up, "seconds is 0.5 in the file and "),
         (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell or openblas SkylakeX"),
-        (lambda c: c.update(blas=None), "blas: none; "),
         (_of_another_kernel, None),  # or this machine lacks the kernel
         (_without_exposures, "retract-rotate decides otherwise"),
-        (_of_another_version, "retract-rotate decides otherwise"),
         (_of_a_better_hand, "retract-rotate decides otherwise"),
         (_in_another_patient, "task straight, patient 0: "),
         (lambda c: c["scores"][0].update(safe_success=0.999), "scores, straight: safe_success is 0.999 in the file"),
         (_left_out, "key.done: "),
+        (lambda c: c["navigations"]["straight"].append(_first(c)), "needs the same first 1 to 20 patients"),
         (_twice, "task straight, patient 1: patient is "),
         (lambda c: c.update(world=asdict(World(friction_factor=0.2))), "key.world: {}; from all else follows {"),
         (lambda c: _on_terms(c, world=World(friction_factor=0.2)), "in the file and"),
-        (lambda c: c.update(robot=asdict(read_robot("kweon-2021-2d"))), "key.robot: {}; from all else follows {"),
-        (lambda c: _on_terms(c, robot=read_robot("kweon-2021-2d")), "in the file and"),
         (lambda c: _on_terms(c, thinking_s=0.5), "decisions, and the navigation goes on"),
         (lambda c: c.update(drawn="mine"), "straight, patient 0: seed 100; the ladder's is"),
         (lambda c: c["key"].update(settings="0" * 64), "key.settings: "),
@@ -406,15 +377,6 @@ def test_the_agent_s_believed_tips_give_its_missed_events_again():
     errs = np.where(np.arange(len(recording.exposed)) > 2, 5.0, 0.0)
     elsewhere = Recording(recording.control, recording.exposed, recording.believed_mm + errs)
     assert repeat(elsewhere, navigation, seed=100)["events"] != figures["events"]
-
-
-def test_a_recording_is_kept_to_the_bit():
-    random = np.random.default_rng(0)
-    recording = Recording(random.normal(size=(180, 1, 2)), np.arange(180) % 7 == 0, random.normal(size=180))
-    again = Recording.unpacked(json.loads(json.dumps(recording.packed())))
-    for name in ("control", "exposed", "believed_mm"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))
-    assert len(json.dumps(recording.packed())) < 8000  # 240 of them are less than 2 MB
 
 
 def test_a_ladder_in_another_world_is_confirmed_in_it(written, tmp_path):

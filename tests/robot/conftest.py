@@ -7,6 +7,7 @@ import shutil
 import subprocess
 
 import pytest
+from drives import running
 
 from endopilot.errors import InputError
 from endopilot.robot.drive import tls_context
@@ -21,7 +22,9 @@ def make_certificates():
     def make(folder):
         with pytest.raises(InputError, match="no such file") as caught:
             tls_context(folder, of_drive=True)
-        recipe = re.search("`(.*)`", str(caught.value)).group(1).replace("rsa:3072", "rsa:2048")  # faster
+        recipe = (
+            re.search("`(.*)`", str(caught.value)).group(1).replace("rsa:3072", "ec -pkeyopt ec_paramgen_curve:P-256")
+        )  # faster
         subprocess.run(recipe, shell=True, check=True, capture_output=True)
         return folder
 
@@ -32,3 +35,10 @@ def make_certificates():
 def certificates(make_certificates, tmp_path_factory):
     """Return a folder with the keys and certificates of a drive and its client."""
     return make_certificates(tmp_path_factory.mktemp("certificates of a drive") / "keys")
+
+
+@pytest.fixture(scope="module")
+def drive(certificates):
+    """Start a drive, and return its process and the port."""
+    with running(certificates) as started:
+        yield started

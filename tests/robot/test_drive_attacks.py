@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from test_drive_process import HOST, running
+from drives import HOST
 
 from endopilot.devices.robot import RobotConfig
 from endopilot.robot.drive import BRAKING_S, LASTS_S, LONGEST_LINE, tls_context
@@ -77,12 +77,6 @@ ATTACKS = {
     "guess tickets": "".join(f"MOVE {number:016x} {SPEED} 0.0\n" for number in range(20_000)),
     "flood while the drive is held up": MOVE * 40_000,
 }
-
-
-@pytest.fixture(scope="module")
-def drive(certificates):
-    with running(certificates) as started:
-        yield started
 
 
 def until_disconnected(process: subprocess.Popen) -> str:

@@ -12,15 +12,14 @@ import time
 
 import numpy as np
 import pytest
+from drives import HOST, running
 
 from endopilot.errors import InputError
 from endopilot.robot.drive import tls_context
 from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import Robot
 
-HOST = "127.0.0.1"
 OBEYED = ("armed", "stopped:silence")  # a machine under load may need more than 200 ms between two lines
-MAIN = "from endopilot.cli import main; main()"
 CLIENT = """
 import sys, time
 from pathlib import Path
@@ -31,37 +30,6 @@ while True:
     print(robot.proximal_state().devices[0][0], flush=True)
     time.sleep(0.05)
 """
-
-
-@contextlib.contextmanager
-def running(certificates, *options):
-    """Start a drive on a free port, yield its process and the port, and check that no traceback was printed."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", MAIN, "drive", "--certificates", str(certificates), "--port", "0", *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        begun = process.stdout.readline()
-        assert begun.startswith(f"listening on {HOST}:"), process.communicate()
-        yield process, int(begun.rsplit(":", 1)[1])
-    finally:
-        process.kill()
-        _, errors = process.communicate(timeout=20)
-    assert "Traceback" not in errors
-
-
-@pytest.fixture
-def drive(certificates):
-    """Start a drive, and return its process and the port."""
-    with running(certificates) as started:
-        yield started
-
-
-def wait_for(process: subprocess.Popen, text: str) -> None:
-    """Read what the drive reports until a line holds some text."""
-    assert any(text in line for line in iter(process.stdout.readline, ""))
 
 
 def moved(robot: RemoteRobot, seconds: float) -> float:
@@ -83,7 +51,7 @@ def test_it_stops_when_its_client_is_killed(drive, certificates) -> None:
     client.send_signal(signal.SIGKILL)
     client.wait()
     client.stdout.close()
-    wait_for(process, "the client has disconnected")
+    assert any("the client has disconnected" in line for line in iter(process.stdout.readline, ""))
     with RemoteRobot(HOST, port, certificates) as robot:
         time.sleep(0.3)
         assert moved(robot, 0.7) < 0.2
@@ -120,7 +88,7 @@ def test_it_stops_200_ms_after_the_last_call_and_goes_on_at_the_next(drive, cert
 
 
 def test_a_command_is_held_while_its_caller_waits(drive, certificates) -> None:
-    process, port = drive
+    _, port = drive
     with RemoteRobot(HOST, port, certificates) as robot:
         before = robot.proximal_state()
         robot.command(((10.0, 0.0),))
@@ -128,7 +96,8 @@ def test_a_command_is_held_while_its_caller_waits(drive, certificates) -> None:
         after = robot.proximal_state()
         assert robot.status in OBEYED
         assert after.devices[0][0] - before.devices[0][0] > 5.0  # 10 mm on a machine that is not under load
-        wait_for(process, ": silence;")
+        while robot.status != "stopped:silence":
+            robot.proximal_state()
 
 
 def test_any_thread_may_call_it(drive, certificates) -> None:
@@ -150,7 +119,6 @@ def test_any_thread_may_call_it(drive, certificates) -> None:
         for thread in threads:
             thread.join()
     assert not failures
-    assert not robot._living.is_alive()
     for call_again in (robot.arm, robot.stop, robot.proximal_state, lambda: robot.command(((1.0, 0.0),)), robot.arm):
         with pytest.raises(InputError, match="it was closed"):
             call_again()
@@ -236,7 +204,7 @@ def test_certificates_are_checked(make_certificates, tmp_path) -> None:
     refuses("drive.key", b"", "drive.key are no")
     refuses("drive.crt", b"nothing", "drive.crt and .*drive.key are no")
     refuses("client.crt", b"", r"certificates: .*client.crt holds no certificate")
-    locked = ["openssl", "rsa", "-aes128", "-passout", "pass:1234", "-in", folder / "drive.key"]
+    locked = ["openssl", "pkey", "-aes128", "-passout", "pass:1234", "-in", folder / "drive.key"]
     key = subprocess.run(locked, check=True, capture_output=True).stdout
     refuses("drive.key", key, "unencrypted key")
     (folder / "drive.key").chmod(0o640)

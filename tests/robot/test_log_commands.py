@@ -52,10 +52,3 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
     assert read_json(made / "manifest.json")["figures"] == replayed
     with Image.open(made / "replay.png") as picture:
         assert min(picture.size) > 400
-
-
-def test_a_log_that_is_not_there_is_named(vessel, tmp_path, capsys) -> None:
-    with pytest.raises(SystemExit) as leaving:
-        main(["replay", str(tmp_path / "none.csv"), "--anatomy", str(vessel), "-o", str(tmp_path / "replay")])
-    assert leaving.value.code == 2
-    assert "none.csv: no such file" in capsys.readouterr().err and not (tmp_path / "replay").exists()

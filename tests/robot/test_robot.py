@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +13,7 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack, Transmission
-from endopilot.errors import InputError
 from endopilot.navigation.loop import start_world
-from endopilot.robot.remote import RemoteRobot
 from endopilot.robot.robot import CYCLE_S, Robot, SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.robots import in_grip
@@ -39,19 +36,6 @@ def test_a_command_is_finite_and_within_limits_whatever_is_asked(translation, ro
     asked = [translation, rotation]
     if all(isinstance(value, float) and np.isfinite(value) for value in asked):
         np.testing.assert_array_equal(command, np.clip(asked, [-40, -12], [40, 12]))
-
-
-@given(some.lists(some.tuples(some.floats(), some.floats()), min_size=1, max_size=4))
-def test_what_is_sent_to_a_drive_is_finite_and_within_its_limits(orders) -> None:
-    robot, sent = object.__new__(RemoteRobot), []
-    robot._lock, robot._ticket, robot.status = threading.RLock(), "ticket", "armed"
-    robot.limits, robot._ask = LIMITS, lambda verb, *words: sent.append((verb, *words[1:]))
-    for translation, rotation in orders:
-        (taken,) = robot.command(((translation, rotation),))
-        assert taken == LIMITS.safe(translation, rotation)
-    assert [verb for verb, *_ in sent] == ["STATE", "MOVE"] * len(orders)
-    numbers = np.array([[float(number) for number in numbers] for _, *numbers in sent[1::2]])
-    assert np.isfinite(numbers).all() and (np.abs(numbers) <= [40.0, 12.0]).all()
 
 
 def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
@@ -83,15 +67,6 @@ def test_a_wire_is_not_driven_beyond_its_end_wherever_the_ostium_truly_is(fork, 
     robot.run(1.0)
     # by the encoder it goes no farther than the travel, and in truth no farther than the wire is laid out for
     assert robot.proximal[0, 0] == pytest.approx(15.0 + min(ostium_mm, 0.0), abs=1e-6)
-
-
-def test_refuses_bad_settings() -> None:
-    for make, message in (
-        (lambda: DriveLimits(max_velocity_mm_s=np.nan, max_rotation_rad_s=1.0), "max_velocity_mm_s: nan"),
-        (lambda: DriveLimits(max_velocity_mm_s=1.0, max_rotation_rad_s=1.0, travel_mm=(3.0, 1.0)), "travel_mm"),
-    ):
-        with pytest.raises(InputError, match=message):
-            make()
 
 
 def with_wire(**changed) -> RobotConfig:

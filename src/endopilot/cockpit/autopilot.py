@@ -24,13 +24,8 @@ _UNTURNED_RAD = np.radians(5.0)
 
 
 class Autopilot:
-    """A policy that drives, watches or waits.
-
-    Attributes:
-        status: "off", "thinking", "drives", "paused", "watches", "reached", "gave up" or "failed".
-        asks: why it asks for X-ray at its next decision; empty if it does not.
-        failure: what went wrong or why the policy gave up, in a line.
-    """
+    """A policy that drives, watches or waits: `status` is "off", "thinking", "drives", "paused", "watches", "reached",
+    "gave up" or "failed", `failure` what went wrong or why it gave up, and `asks` why it asks for X-ray next, if so."""
 
     def __init__(self, world: LiveWorld) -> None:
         self.status, self.policy_name, self.asks, self.failure = "off", "", "", ""

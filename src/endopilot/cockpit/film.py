@@ -15,7 +15,7 @@ from jaxtyping import Float
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit import messages
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
+from endopilot.cockpit.frames import device_arrays, encode, motion_values, tip_values
 from endopilot.cockpit.recording import SUFFIX, read_session, replayed
 from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
@@ -255,13 +255,11 @@ class ReplayStage:
         return {
             "mode": "replay",
             **motion_values(snapshot),
+            **self._xray.seen(snapshot.time_s, film.navigation.target),
             "command": snapshot.velocity,
             "stopped": "",
             "peak_force_n": round(film.frames[self.at].peak_n, 4),
             "sight": True,
-            "target": target_values(anatomy, film.navigation.target),
-            "xray": self._xray.values(snapshot.time_s),
-            "target_px": self._xray.pixels(film.navigation.target.position(anatomy)),
             "replay": {
                 "title": film.title,
                 "seconds": round(film.seconds, 3),

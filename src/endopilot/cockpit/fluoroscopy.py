@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot
+from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import is_coronary, surroundings
 from endopilot.xray.carm import view_at
@@ -28,15 +28,9 @@ _NICE = 10  # of the thread that computes views: the wire goes first
 
 @dataclass(frozen=True)
 class XraySettings:
-    """How the C-arm stands and what its pedal does.
-
-    Attributes:
-        angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, of each plane, degrees.
-        biplane: two planes, or the first alone.
-        frames_per_s: pulses of fluoroscopy, 1/s.
-        dose: of a frame, as a multiple of the usual one.
-        roadmap: lay the vessel of the last injection under the live image.
-    """
+    """How the C-arm stands, LAO (positive) or RAO, and cranial (positive) or caudal, degrees, of two planes or the
+    first alone, and what its pedal does: pulses a second, each of a multiple of the usual dose, and whether the vessel
+    of the last injection lies under the live image."""
 
     angles_deg: tuple[tuple[float, float], tuple[float, float]] = ((-30.0, 0.0), (60.0, 0.0))
     zoom: float = 1.0
@@ -52,19 +46,15 @@ class XraySettings:
 
 
 class XrayUnit:
-    """C-arm, pedal and contrast of one patient; `configure` changes its settings.
-
-    Attributes:
-        frames: exposures so far, of both planes together as one; `seconds` of fluoroscopy, s.
-        kerma_ugy: air kerma at the patient's entrance reference point so far, both planes, µGy.
-        background: what the patient looks like: "CT", "phantom", or "plain" water.
-    """
+    """C-arm, pedal and contrast of one patient, who looks like "CT", "phantom", or "plain" water. So far there were
+    `frames`, of both planes together as one, `seconds` of fluoroscopy, and `kerma_ugy`, the air kerma at the patient's
+    entrance reference point of both planes, µGy."""
 
     def __init__(
         self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager], ct: Volume | None = None
     ) -> None:
         """Compute the first view in the background; without a CT (HU) a coronary artery lies in a phantom's."""
-        self.settings = XraySettings()
+        self.settings, self._anatomy = XraySettings(), anatomy
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
         self.background = "plain" if ct is None else "CT"
         self._image_s = self._contrast_s = -np.inf
@@ -157,23 +147,26 @@ class XrayUnit:
             "contrast": round(self.contrast(now_s), 2),
             "has_roadmap": any(plane in self._roadmap for plane in settings.planes),
             "background": self.background,
-            "angles_deg": settings.angles_deg,
-            "zoom": settings.zoom,
-            "biplane": settings.biplane,
-            "frames_per_s": settings.frames_per_s,
-            "dose": settings.dose,
-            "roadmap": settings.roadmap,
+            **vars(settings),
         }
 
-    def pixels(self, point: Float[np.ndarray, "3"]) -> list[list[float]]:
-        """Return where a point of the patient, LPS mm, lies in the image of each plane: column and row."""
-        found = []
+    def seen(self, now_s: float, target: Target) -> dict[str, Any]:
+        """Return what the page shows of the unit and of a target: place, LPS mm, branch, abscissa (mm), section, and
+        column and row in the image of each plane."""
+        branch, position = self._anatomy.tree.branches[target.branch], target.position(self._anatomy)
+        nearest, found = int(np.abs(branch.centerline.abscissa - target.abscissa).argmin()), []
+        place = {
+            "position": position.round(3).tolist(),
+            "branch": target.branch,
+            "abscissa": round(target.abscissa, 2),
+            "section": self._anatomy.tree.section_names[int(branch.section[nearest])],
+        }
         for angles, factor in self.settings.planes:
             view = view_at(angles, self.imager.isocenter, self.imager.config.geometry)
-            right, up = factor * view.project(point)
+            right, up = factor * view.project(position)
             middle = (self.imager.config.pixels - 1) / 2
             found.append([round(middle + float(right), 1), round(middle - float(up), 1)])
-        return found
+        return {"xray": self.values(now_s), "target": place, "target_px": found}
 
     def close(self) -> None:
         """Stop computing."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.cockpit.world import Snapshot
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy
 
 _TYPES = {np.dtype("<f4"): "f4", np.dtype("<u4"): "u4", np.dtype("u1"): "u1"}
@@ -137,17 +137,3 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
         labels=np.concatenate(labels).astype("<u4"),
         abscissa=np.concatenate(places).astype("<f4"),
     )
-
-
-def target_values(anatomy: Anatomy, target: Target | None) -> dict[str, Any] | None:
-    """Return the target for the page: its place, LPS mm, branch, abscissa (mm) and section."""
-    if target is None:
-        return None
-    branch = anatomy.tree.branches[target.branch]
-    nearest = int(np.abs(branch.centerline.abscissa - target.abscissa).argmin())
-    return {
-        "position": target.position(anatomy).round(3).tolist(),
-        "branch": target.branch,
-        "abscissa": round(target.abscissa, 2),
-        "section": anatomy.tree.section_names[int(branch.section[nearest])],
-    }

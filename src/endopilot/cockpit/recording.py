@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +18,27 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.world import LiveWorld
-from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
 from endopilot.navigation.loop import LoopConfig
-from endopilot.settings import from_record
+from endopilot.settings import CountOrZero, from_record, settings
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.types import Anatomy
 
-FORMAT = "endopilot cockpit 3"
+FORMAT = "endopilot cockpit 4"
 SUFFIX = ".cockpit.jsonl"
 CHECK_S = 0.25  # time from one check to the next, s
 
 
-@dataclass(frozen=True)
+@settings
 class Where:
     """Where a session takes place: in the folder of an anatomy, or in patient `place` of a task of the ladder."""
 
     patient: Path | None = None
     task: str | None = None
-    place: int = 0
+    place: CountOrZero = 0
 
 
 class Recorder:
@@ -102,12 +101,9 @@ def read_session(path: Path) -> RecordedSession:
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
     with reading(path, "choose another session"):
-        where = Where(
-            patient=None if header["patient"] is None else Path(header["patient"]),
-            task=header["task"],
-            place=header["place"],
-        )
-        navigation = _navigation(path, header, where)
+        where = from_record(Where, header["where"])
+        anatomy = _anatomy(path, header["identity"], where)
+        navigation = from_record(Navigation, header["navigation"] | {"anatomy": anatomy, "robot": None})
         events = tuple(lines[1:])
         np.random.default_rng(int(header["seed"]))  # which must not be negative
         for event in events:
@@ -169,29 +165,14 @@ def _check(event: dict[str, Any]) -> None:
 
 def _header(world: LiveWorld, where: Where, seed: int) -> dict[str, Any]:
     navigation = world.navigation
-    values = {
-        "format": FORMAT,
-        "version": __version__,
-        "patient": None if where.patient is None else str(where.patient.resolve()),
-        "task": where.task,
-        "place": where.place,
-        "identity": navigation.anatomy.identity,
-        "device": asdict(navigation.device),
-        "target": asdict(navigation.target),
-        "start": [navigation.start_inserted_length_mm, navigation.start_rotation_rad],
-        "seconds": navigation.seconds,
-        "force_limit_n": navigation.force_limit_n,
-        "config": asdict(world.config),
-        "world": asdict(world.reality),
-        "seed": seed,
-    }
-    if navigation.catheters:
-        values["catheters"] = [asdict(catheter) for catheter in navigation.catheters]
-        values |= {"arrives": navigation.arrives, "start_catheter_mm": navigation.start_catheter_mm}
-    return json.loads(json_text(values))
+    about = {"format": FORMAT, "version": __version__, "identity": navigation.anatomy.identity}
+    about |= {"where": replace(where, patient=where.patient and where.patient.resolve())}
+    given = [field.name for field in fields(navigation) if field.name not in ("anatomy", "robot")]
+    about |= {"navigation": {name: getattr(navigation, name) for name in given}}
+    return json.loads(json_text(about | {"config": world.config, "world": world.reality, "seed": seed}))
 
 
-def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
+def _anatomy(path: Path, identity: str, where: Where) -> Anatomy:
     if where.task is not None:
         from endopilot.tasks.task import task_by_hand  # slow to import, and needed for tasks alone
 
@@ -200,20 +181,9 @@ def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
         anatomy = read_anatomy(where.patient)
     else:
         raise InputError(f"{path}: names no patient and no task; choose another session")
-    if anatomy.identity != header["identity"]:
+    if anatomy.identity != identity:
         raise InputError(f"{path}: {anatomy.name} is another vessel now; bring the one back that it was recorded in")
-    return Navigation(
-        anatomy=anatomy,
-        device=from_record(Wire, header["device"]),
-        target=from_record(Target, header["target"]),
-        start_inserted_length_mm=header["start"][0],
-        start_rotation_rad=header["start"][1],
-        seconds=header["seconds"],
-        force_limit_n=header["force_limit_n"],
-        catheters=tuple(from_record(Catheter, catheter) for catheter in header.get("catheters", ())),
-        arrives=header.get("arrives", "wire"),
-        start_catheter_mm=header.get("start_catheter_mm", 0.0),
-    )
+    return anatomy
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

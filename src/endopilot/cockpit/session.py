@@ -15,7 +15,7 @@ import numpy as np
 from endopilot.cockpit import messages
 from endopilot.cockpit.autopilot import Autopilot
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
+from endopilot.cockpit.frames import device_arrays, encode, motion_values, tip_values
 from endopilot.cockpit.messages import Message
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import LiveWorld, Snapshot
@@ -129,21 +129,18 @@ class Session:
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the figures that the page shows."""
-        anatomy = self.world.navigation.anatomy
         shown = {
             "mode": "drive",
             **motion_values(snapshot, self.world.loop.robot.counted),
+            **self.xray.seen(snapshot.time_s, self.target),
             "command": tuple(chain.from_iterable(self._command)),
             "stopped": self._stopped,
             "peak_force_n": round(self.world.peak_force_n, 4),
             "sight": self.sight,
             "reserve": round(self.world.reserve, 1),
-            "target": target_values(anatomy, self.target),
-            "xray": self.xray.values(snapshot.time_s),
-            "target_px": self.xray.pixels(self.target.position(anatomy)),
             "autopilot": self.autopilot.values(),
         }
-        return shown | (tip_values(anatomy, snapshot) if self.sight else {})
+        return shown | (tip_values(self.world.navigation.anatomy, snapshot) if self.sight else {})
 
     def close(self) -> None:
         """Stop the wire and close the recording."""

@@ -26,14 +26,8 @@ BY_HAND = LoopConfig(cycle_s=0.0125)  # a hand's commands act sooner than a poli
 
 @dataclass(frozen=True, eq=False)
 class ShownDevice:
-    """Wire or catheter at the end of a cycle.
-
-    Attributes:
-        nodes: of its axis from its tip to a little behind the ostium, LPS mm.
-        node_force: of the wall at each of them, N; 0 where it lies in a catheter.
-        tip: Δtip, γtip, branch and lumen radius, as arrays of one.
-        inserted_length_mm: Δ, mm, as it truly is; `rotation` is φ of its drive, rad.
-    """
+    """Wire or catheter at the end of a cycle: nodes of its axis from its tip to a little behind the ostium, LPS mm, the
+    wall's force on each, N (0 where it lies in a catheter), its tip as arrays of one, the true Δ, mm, and φ, rad."""
 
     nodes: Float[np.ndarray, "n 3"]
     node_force: Float[np.ndarray, "n"]
@@ -44,17 +38,10 @@ class ShownDevice:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot(ShownDevice):
-    """The wire, and the world around it, at the end of a cycle.
-
-    Attributes:
-        velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
-        force_n: largest wall force on one node during the cycle, N.
-        wall_force_n: largest resultant of the wall on 2 mm of the wire, N.
-        drive_load: push (N) and torque (N·mm) of the wire's drive, then of each catheter's.
-        slip: advance (mm) and rotation (rad) that each drive was asked for and slipped over in the cycle.
-        valid: false once the simulation has failed.
-        catheters: around the wire, from the inside out.
-    """
+    """The wire, the catheters around it from the inside out, and the world, at the end of a cycle. Of the wire and then
+    of each catheter: the motor's velocity (mm/s, rad/s), the drive's push (N) and torque (N·mm), and the advance (mm)
+    and rotation (rad) that it slipped over. `force_n` is the largest wall force on one node during the cycle,
+    `wall_force_n` the largest resultant on 2 mm of the wire, N; `valid` is false once the simulation has failed."""
 
     cycle: int
     time_s: float

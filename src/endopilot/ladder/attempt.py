@@ -34,14 +34,9 @@ _MOST_BYTES = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What was decided during a navigation, in full precision: it is enough to drive the navigation again.
-
-    Attributes:
-        control: velocities of each device at each decision, within the robot's limits, mm/s and rad/s.
-        exposed: whether X-ray was on at each decision.
-        believed_mm: Δtip as the agent believed it at each decision, mm; None for other policies.
-        terms: on which it was driven; not part of the text.
-    """
+    """What was decided during a navigation, in full precision: enough to drive it again on its terms. At each decision
+    the velocities of each device within the robot's limits (mm/s, rad/s), whether X-ray was on, and, of the agent, Δtip
+    as it believed it, mm."""
 
     control: Float[np.ndarray, "decisions devices 2"]
     exposed: Bool[np.ndarray, "decisions"]
@@ -109,11 +104,8 @@ def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = Fa
 
 
 def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
-    """Drive the recorded velocities through the same robot and simulator, and return the figures, as `attempt` did.
-
-    Raises:
-        InputError: the recording is longer or shorter than the navigation, or holds what the drives do not do.
-    """
+    """Drive the recorded velocities through the same robot and simulator, and return the figures, as `attempt` did;
+    InputError where the recording is longer or shorter than the navigation, or holds what the drives do not do."""
     record = begun(recording, navigation, seed=seed).run()
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:

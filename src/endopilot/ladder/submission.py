@@ -78,21 +78,13 @@ class NavigationEntry:
 
 @settings
 class Submission:
-    """What a policy did on the ladder, and how that can be done again.
+    """What a policy did on the ladder, and how that can be done again: the SHA-256 of each task with its device, and
+    its navigations in the order of its patients, which were drawn by the word `drawn`, if any (`Terms.drawn`).
 
-    Attributes:
-        ladder: its version.
-        key: what must be equal for two files to be compared (`key_of`); it follows from all else here.
-        origin: package and version that the policy comes from, or its file and the SHA-256 of that.
-        core: processor level that the rod core was built for.
-        blas: kernel of linear algebra of numpy and SciPy, such as openblas Haswell.
-        tasks: name of each task and the SHA-256 of its definition with its device.
-        navigations: by the task's name, in the order of the task's patients.
-        drawn: the word with which patients were drawn, where they were (`Terms.drawn`).
-        thinking_s: how long each decision was taken to take, s (`Terms`).
-        decision_ms: how long decisions truly took where the file was made, ms, median and 99th percentile; another
-            machine takes another time, so that nothing confirms it.
-    """
+    `key` must be equal for two files to be compared (`key_of`); it follows from all else here. `origin` is the package
+    and version of the policy, or its file and the SHA-256 of that; `core` the processor level of the rod core, `blas`
+    the kernel of linear algebra, such as openblas Haswell. Nothing confirms `decision_ms`, how long decisions took, ms,
+    median and 99th percentile: another machine takes another time."""
 
     format: Literal[1] = 1
     ladder: LadderVersion
@@ -132,21 +124,12 @@ def key_of(terms: Terms, counts: Mapping[str, int]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SubmissionCheck:
-    """What came of the check of a submission.
+    """What came of the check of a submission: policy, origin and key as the file says, the kernel of linear algebra
+    that so many navigations were driven again with, the first difference in words, if any, what else is to be known,
+    and how long decisions took here, ms, median and 99th percentile; None where it did not decide.
 
-    Attributes:
-        verdict: one of `Verdict`.
-        policy: name of the policy, as the file says.
-        origin: where the policy comes from, as the file says.
-        key: scores under equal keys may be compared (`key_of`).
-        kernel: of linear algebra, that all was driven again with.
-        navigations: their number.
-        difference: the first that differs from the file, in words; None where nothing does.
-        scores: of what was driven again. A recording says when X-ray was on, and velocities do not tell whether that is
-            true: unless a policy decided again, there are no exposures and no missed events.
-        remarks: what else is to be known.
-        decision_ms: how long its decisions took here, ms, median and 99th percentile; None where it did not decide.
-    """
+    The scores are of what was driven again. Velocities do not tell whether X-ray was on when the recording says so:
+    unless a policy decided again, there are no exposures and no missed events."""
 
     verdict: Verdict
     policy: str
@@ -207,11 +190,8 @@ def write_submission(
 
 
 def read_submission(path: str | Path) -> Submission:
-    """Read a submission file, whose scores are not checked.
-
-    Raises:
-        InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
-    """
+    """Read a submission file, whose scores are not checked; InputError where the file is none, or its tasks or seeds
+    are not those of this ladder."""
     path = Path(path)
     submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
     if set(submission.tasks) != set(submission.navigations):

@@ -38,16 +38,10 @@ def is_bag(path: Path) -> bool:
 
 def read_bag(path: Path, topics: Sequence[str] = ()) -> Columns:
     """Return a row of a log for each message, NaN where it says nothing; times are those of the messages' headers if
-    all have one, else those at which the bag got them.
-
-    Args:
-        path: of the bag.
-        topics: PART=TOPIC, or PART=TOPIC:JOINT,JOINT with joints of a JointState by name, in the order translation,
-            rotation, the wire first; a part of `PARTS` that is not named is looked for in the topic of its name.
-
-    Raises:
-        InputError: it is no bag, or lacks a topic, which is named beside those that it has.
-    """
+    all have one, else those at which the bag got them. `topics` are PART=TOPIC, or PART=TOPIC:JOINT,JOINT with joints
+    of a JointState by name, translation and then rotation, the wire first; a part of `PARTS` that is not named is
+    looked for in the topic of its name. InputError for no bag, or for a topic that it lacks, names those that it
+    has."""
     with extra_named(f"{path}: a ROS bag"):
         from rosbags.highlevel import AnyReader, AnyReaderError  # pyright: ignore[reportMissingImports]
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]

@@ -93,11 +93,10 @@ class RobotCalibration:
 
     Attributes:
         robot: with lag, gain and plays as they were found; what is not identified is as it was known.
-        wire: with the tip, friction and stiffness of the best candidate, those too that are not identified: they belong
-            together. As it was known where the layer was left out.
+        wire: with the constants of the best candidate, which belong together, identified or not; as it was known where
+            the layer was left out.
         estimates: each constant with its interval.
-        layers: what slip, the simulated wire's slack and the wire gained on episodes left out, or that they were left
-            out.
+        layers: what slip, a simulated wire's slack and the wire gained on episodes left out, or that it was left out.
         band_mm: half-width within which Δtip is predicted throughout nine of ten episodes of another session (log), mm,
             by the drive alone where the slack was left out; None with too few sessions.
         next_band_mm: the same of one more episode of these sessions, mm; None with too few episodes.
@@ -124,18 +123,9 @@ def calibrate(
     robot: RobotConfig | None = None,
     config: CalibrateConfig | None = None,
 ) -> RobotCalibration:
-    """Calibrate a robot and its wire.
-
-    Args:
-        logs: what the robot was asked for, and what was seen.
-        anatomy: the vessel that it was driven through.
-        device: the wire, as it is known.
-        robot: what is known of the robot; the fields that are found are replaced.
-        config: how they are fitted.
-
-    Raises:
-        InputError: too few episodes; an axis is counted the other way round, or in another unit.
-    """
+    """Calibrate a robot and its wire, as they are known, by logs of driving the wire through a vessel; the fields that
+    are found are replaced. InputError for too few episodes, or an axis counted the other way round, or in another
+    unit."""
     config, robot = config or CalibrateConfig(), robot or RobotConfig()
     episodes = usable_episodes(logs, anatomy)
     if len(episodes) < LEAST_EPISODES:
@@ -196,11 +186,7 @@ def of_drive(fit: DriveFit) -> dict[str, Estimate]:
 
 
 def check_forward(log: str, fit: DriveFit) -> None:
-    """Check that the tip goes on where the translation grows, about as far.
-
-    Raises:
-        InputError: it goes back, or much farther or less.
-    """
+    """Raise InputError where the tip goes back as the translation grows, or much farther or less."""
     gain, half = float(fit.values[0]), float(fit.half_width[0])
     least, most = DRIVE["gain_translation"]
     if gain + half < least or gain - half > most:
@@ -209,11 +195,7 @@ def check_forward(log: str, fit: DriveFit) -> None:
 
 
 def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: CalibrateConfig) -> None:
-    """Check that a rotation that is turned predicts episodes no better. In a flat vessel it does as well.
-
-    Raises:
-        InputError: it does better.
-    """
+    """Raise InputError where a rotation that is turned predicts episodes better; in a flat vessel it does as well."""
     other = [replace(log, command=log.command * [1.0, -1.0]) for log in of.logs]
     turned = replace(of, logs=other, courses=Courses.of(other, robot.wire))
     as_it_is, better = (_wire_costs(each, device, robot, config) for each in (of, turned))
@@ -311,17 +293,11 @@ def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str 
 
 
 def bands(errors: Float[np.ndarray, "episodes"], logs: Sequence[str]) -> tuple[float | None, float | None]:
-    """Return half-widths that hold throughout nine of ten episodes: of another log, and of one more of these, mm.
+    """Return half-widths that hold throughout nine of ten episodes, of another log and of one more of these, mm, by the
+    largest error of Δtip in each episode and the name of its log; None where there are too few logs, or episodes.
 
-    The logarithm of an episode's largest error is its log's median and a rest, which is drawn from all rests, each log
-    counting the same. A log that is not known yet adds the variance between logs, by Student's t.
-
-    Args:
-        errors: largest error of Δtip in each episode, mm.
-        logs: name of each one's log.
-
-    Returns:
-        None where there are too few logs, or episodes.
+    The logarithm of an error is its log's median and a rest, which is drawn from all rests, each log counting the same.
+    A log that is not known yet adds the variance between logs, by Student's t.
     """
     size, log = np.log(np.maximum(errors, 1e-6)), np.unique(np.asarray(logs), return_inverse=True)[1]
     count = np.bincount(log)

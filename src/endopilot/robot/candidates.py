@@ -32,15 +32,8 @@ LEAST_EPISODES = 5
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter, as logs tell it.
-
-    Attributes:
-        value: that of the best candidate.
-        low: least value that is not worse, at 95 %.
-        high: largest.
-        searched: least and largest value that was tried.
-        unit: of the number.
-    """
+    """A parameter, as logs tell it: the value of the best candidate, the least and largest that are not worse, at 95 %,
+    and those that were tried."""
 
     value: float
     low: float
@@ -64,14 +57,8 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Parameters that were tried.
-
-    Attributes:
-        ranges: least and largest value of each parameter that was searched.
-        values: of each candidate.
-        costs: of each candidate in each episode.
-        least: so many count as good at least: where few were tried, none of them is the best that there is.
-    """
+    """Parameters that were tried within ranges, and what each candidate costs in each episode. So many as `least` count
+    as good: where few were tried, none of them is the best that there is."""
 
     ranges: Mapping[str, tuple[float, float]]
     values: Float[np.ndarray, "candidates parameters"]
@@ -110,16 +97,8 @@ class Candidates:
 def search(
     costs: Costs, ranges: Mapping[str, tuple[float, float]], *, first: int, rounds: int, draws: int, seed: int = 0
 ) -> Candidates:
-    """Find parameters, and all that are as good.
-
-    Args:
-        costs: of candidates in each episode, finite.
-        ranges: of each parameter: least and largest value.
-        first: number of candidates that are drawn from everywhere.
-        rounds: in which candidates are drawn around those that are not worse.
-        draws: number of them in each round.
-        seed: of all.
-    """
+    """Find parameters within ranges by their finite costs, and all that are as good: the `first` candidates are drawn
+    from everywhere, and in each of the `rounds` so many as `draws` around those that are not worse."""
     from scipy.stats import qmc  # slow to import
 
     low, high = np.array(list(ranges.values()), dtype=float).T

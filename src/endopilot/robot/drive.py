@@ -58,27 +58,16 @@ _NUMBER = re.compile(
 
 
 class Drive:
-    """The machine: motion, watchdog, and who may command.
-
-    Attributes:
-        stopped: why the drive stands still, or None while it is armed: "start", "silence", "connection", "not-finite",
-            "limit", "travel", "malformed" or "asked".
-        dropped: commands that came with a ticket too old, void or never given.
-        owner: the session that commands, if any.
-        news: lines for people, on stops, clients and strangers; whoever shows them takes them out.
-    """
+    """The machine: motion, watchdog, and its client, if one has `taken` it. `stopped` is why it stands still, or None
+    while it is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked";
+    `dropped` counts commands whose ticket was too old, void or never given; `news` are lines for people, who take them
+    out."""
 
     def __init__(
         self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
     ) -> None:
-        """Stand still, unarmed.
-
-        Args:
-            limits: a command beyond them, or the end of the travel, stops the drive.
-            now: time by the drive's clock, s.
-            config: latency, accelerations and noise; the encoders sit at the motor, for there is no wire.
-            inserted_length: Δ at the start, mm.
-        """
+        """Stand still, unarmed, at Δ (mm) and at a time by the drive's clock (s); a command beyond the limits, or the
+        end of the travel, will stop it. The encoders sit at the motor, for there is no wire."""
         config = config or RobotConfig()
         self._limits, start = limits, np.array([[[inserted_length, 0.0]]])
         self._motion = DriveMotion(config, [[limits]], start)
@@ -90,7 +79,7 @@ class Drive:
         self._state: str | None = None
         self.stopped: str | None = "start"
         self.dropped = 0
-        self.owner: Session | None = None
+        self.taken, self._held = False, b""
         self.news: deque[str] = deque(maxlen=_MOST_NEWS)
 
     @property
@@ -135,13 +124,8 @@ class Drive:
             self.stopped, self._state, self._heard = None, None, heard
 
     def move(self, ticket: str, translation: float, rotation: float) -> None:
-        """Take a command, mm/s and rad/s, if armed; the newest of one instant alone is obeyed.
-
-        Args:
-            ticket: that the drive gave so lately that it lasts; with any other nothing happens.
-            translation: one that is not finite or beyond the limits stops the drive.
-            rotation: likewise.
-        """
+        """Take a command, mm/s and rad/s, if armed and the ticket lasts; the newest of one instant alone is obeyed, and
+        one that is not finite or beyond the limits stops the drive."""
         heard = self._given(ticket)
         if heard is None or self.stopped is not None:
             return
@@ -162,12 +146,49 @@ class Drive:
             self._state = f"STATE {read} {status} {self._ticket()}\n"
         return self._state
 
-    def open(self) -> Session:
-        """Return the drive's side of a new connection; there is one at a time, the `owner`."""
-        assert self.owner is None
-        self.owner = Session(self)
+    def open(self) -> None:
+        """Take a client, of which there is one at a time."""
+        assert not self.taken
+        self.taken, self._held = True, b""
         self.news.append("a client is connected")
-        return self.owner
+
+    def receive(self, data: bytes, now: float) -> bytes | None:
+        """Take bytes of the client as they came, cut anywhere, and return an answer for each line that they end; None
+        for a line that never ends, after which the connection is to be closed."""
+        self.tick(now)
+        *lines, self._held = (self._held + data).split(b"\n")
+        answers = [self._answer(line) for line in lines]
+        if len(self._held) >= LONGEST_LINE:
+            self.stop("malformed")
+            return None
+        return "".join(answers).encode("ascii")
+
+    def close(self, now: float) -> None:
+        """Note that the client's connection is closed, at a time by the drive's clock, s; the drive stops."""
+        self.tick(now)
+        self.stop("connection")
+        self.taken = False
+        self.news.append("the client has disconnected")
+
+    def _answer(self, line: bytes) -> str:
+        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
+        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
+        match text.split(" "):
+            case ["STATE"]:
+                pass
+            case ["STOP"]:
+                self.stop("asked")
+            case ["ARM", ticket]:
+                self.arm(ticket)
+            case ["MOVE", ticket, first, second]:
+                translation, rotation = number(first), number(second)
+                if translation is None or rotation is None:
+                    self.stop("malformed")
+                else:
+                    self.move(ticket, translation, rotation)
+            case _:
+                self.stop("malformed")
+        return self.state()
 
     @property
     def greeting(self) -> str:
@@ -204,63 +225,6 @@ class Drive:
             self.stop("travel")
 
 
-class Session:
-    """The drive's side of the connection of its owner."""
-
-    def __init__(self, drive: Drive) -> None:
-        """Wait for the first line."""
-        self._drive, self._held, self.closed = drive, b"", False
-
-    def receive(self, data: bytes, now: float) -> bytes:
-        """Take what one read brought and return the answers, one for each line that it ends.
-
-        A line that never ends closes the session.
-
-        Args:
-            data: bytes as they came, cut anywhere.
-            now: time by the drive's clock, s.
-        """
-        self._drive.tick(now)
-        if self.closed:
-            return b""
-        *lines, self._held = (self._held + data).split(b"\n")
-        answers = [self._answer(line) for line in lines]
-        if len(self._held) >= LONGEST_LINE:
-            self._drive.stop("malformed")
-            self.close(now)
-        return "".join(answers).encode("ascii")
-
-    def close(self, now: float) -> None:
-        """Note that the connection is closed, at a time by the drive's clock, s; the drive stops."""
-        self._drive.tick(now)
-        self.closed, self._held = True, b""
-        if self._drive.owner is self:
-            self._drive.stop("connection")
-            self._drive.owner = None
-            self._drive.news.append("the client has disconnected")
-
-    def _answer(self, line: bytes) -> str:
-        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
-        drive = self._drive
-        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
-        match text.split(" "):
-            case ["STATE"]:
-                pass
-            case ["STOP"]:
-                drive.stop("asked")
-            case ["ARM", ticket]:
-                drive.arm(ticket)
-            case ["MOVE", ticket, first, second]:
-                translation, rotation = number(first), number(second)
-                if translation is None or rotation is None:
-                    drive.stop("malformed")
-                else:
-                    drive.move(ticket, translation, rotation)
-            case _:
-                drive.stop("malformed")
-        return drive.state()
-
-
 def number(text: str) -> float | None:
     """Return the number that a field holds, in decimal digits, NaN or infinite; None for anything else.
 
@@ -270,17 +234,9 @@ def number(text: str) -> float | None:
 
 
 def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
-    """Return the TLS settings of one side: its own key and certificate, and the one certificate that it trusts.
-
-    Args:
-        folder: holds PEM files: `drive.key`, `drive.crt` and `client.crt` for the drive; `client.key`, `client.crt` and
-            `drive.crt` for the client.
-        of_drive: for the drive, or for its client.
-
-    Raises:
-        InputError: a file is missing or holds something else; the key is encrypted, open to others, or of another
-            certificate.
-    """
+    """Return the TLS settings of the drive or of its client: its own key and certificate, and the one that it trusts,
+    PEM files in a folder (`drive.key`, `drive.crt`, `client.crt`; `client.key`, `client.crt`, `drive.crt`). InputError
+    where one is missing or holds something else, or the key is encrypted, open to others, or of another certificate."""
     side, other = ("drive", "client") if of_drive else ("client", "drive")
     key, own, trusted = folder / f"{side}.key", folder / f"{side}.crt", folder / f"{other}.crt"
     mend = f"copy it there, or make both sides' with `{_recipe(folder)}`"
@@ -316,25 +272,15 @@ def _recipe(folder: Path) -> str:
 
 
 async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say: Callable[[str], None]) -> None:
-    """Let a drive listen and run until SIGTERM, or until it is cancelled.
-
-    Args:
-        drive: made with `now=time.monotonic()`.
-        context: of `tls_context`.
-        host: address to listen on.
-        port: TCP port; 0 for a free one.
-        say: called with each line for people.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
+    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until SIGTERM, or until it
+    is cancelled; `say` is called with each line for people. InputError where the address cannot be listened on."""
 
     async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if drive.owner is None:
-            await _obey(drive, reader, writer)
-        else:
+        if drive.taken:
             writer.write(f"{PROTOCOL} BUSY\n".encode("ascii"))
             writer.close()
+        else:
+            await _obey(drive, reader, writer)
 
     terminated = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
@@ -365,7 +311,8 @@ def _listen(host: str, port: int) -> socket.socket:
 
 async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Answer the lines of a client that showed its certificate, until it is gone; then the drive stops."""
-    session, why = drive.open(), ""
+    drive.open()
+    why = ""
     writer.write(drive.greeting.encode("ascii"))
     try:
         while not why:
@@ -373,9 +320,10 @@ async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.Stre
                 data = await reader.read(READ_BYTES)
             if not data:
                 break
-            writer.write(session.receive(data, time.monotonic()))
+            answers = drive.receive(data, time.monotonic())
+            writer.write(answers or b"")
             await asyncio.sleep(0)  # what a client sends at once holds nobody up
-            if session.closed:
+            if answers is None:
                 why = "a line of it has no end"
             elif writer.transport.get_write_buffer_size() > MOST_UNREAD:
                 why = "it does not read the answers"
@@ -387,4 +335,4 @@ async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.Stre
         if why:
             drive.news.append(f"the client is sent away: {why}")
         writer.transport.abort()
-        session.close(time.monotonic())
+        drive.close(time.monotonic())

@@ -45,13 +45,8 @@ slip by anything up to their travel; and the share of slips that are losses, not
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Tips of episodes along their vessel, beside what their drives were asked for.
-
-    Attributes:
-        courses: commands, and times of the tips.
-        abscissa: Δtip, mm; NaN where it is not to be used.
-        slack: how much farther than its proximal end a simulated wire's tip went, mm.
-    """
+    """Tips of episodes along their vessel (Δtip, mm; NaN where it is not to be used), beside what their drives were
+    asked for. `slack` is how much farther than its proximal end a simulated wire's tip went, mm."""
 
     courses: Courses
     abscissa: Float[np.ndarray, "episodes tips"]
@@ -76,15 +71,9 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What a Kalman filter leaves of residuals.
-
-    Attributes:
-        innovation: in standard deviations; 0 where there is no tip, and where one jumps.
-        gain: weight by which each tip moves the offset.
-        spread: standard deviation of each innovation, mm.
-        cost: -2 log likelihood.
-        offset: where the offset is after the last tip, mm.
-    """
+    """What a Kalman filter leaves of residuals: each innovation in standard deviations (`spread`, mm; 0 where there is
+    no tip, or one jumps), the `gain` by which each tip moves the offset, the `cost`, -2 log likelihood, and the last
+    `offset`, mm."""
 
     innovation: Float[np.ndarray, "*of tips"]
     gain: Float[np.ndarray, "*of tips"]
@@ -98,13 +87,8 @@ def filtered(
     travel: Float[np.ndarray, "episodes tips"],
     noise: Sequence[Float[np.ndarray, "..."] | float],
 ) -> Filtered:
-    """Filter residuals whose mean drifts with travel, and slips or jumps now and then.
-
-    Args:
-        residual: mm; NaN where there is no tip.
-        travel: of the drive since the tip before, mm, backward negative.
-        noise: of `Noise`, each for all or to be broadcast.
-    """
+    """Filter residuals, mm (NaN where there is no tip), whose mean drifts with the drive's travel since the tip before,
+    mm, backward negative, and slips or jumps now and then, by `Noise`, each for all or to be broadcast."""
     sd, drift, slips, lost = noise
     shape = np.broadcast_shapes(residual.shape[:-1], np.shape(sd))
     offset, variance, cost = np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)
@@ -116,8 +100,8 @@ def filtered(
             spread, ahead = sd * np.sqrt(variance + 1), np.where(begun & there, value - offset, 0.0)
             z, on = ahead / spread, np.where(way < 0, -ahead, ahead) / spread
             follows = (1 - slips - _JUMPS) * np.exp(-(z**2) / 2) / (math.sqrt(2 * np.pi) * spread)
-            behind, before = ndtr(on + far / spread) - ndtr(on), ndtr(on) - ndtr(on - far / spread)
-            slipped = slips / far * (lost * behind + (1 - lost) * before)
+            ahead_of, here, behind = ndtr([on + far / spread, on, on - far / spread])
+            slipped = slips / far * (lost * (ahead_of - here) + (1 - lost) * (here - behind))
             whole = follows + slipped + _JUMPS / _WITHIN_MM
             share = np.where(begun, follows / whole, 0.0)
             cost -= np.where(there & begun, 2 * np.log(np.where(begun, whole, 1.0)), 0.0)
@@ -133,16 +117,9 @@ def filtered(
 
 @dataclass(frozen=True, eq=False)
 class DriveFit:
-    """Kinematics that explain tracks best.
-
-    Attributes:
-        values: of `NAMES`.
-        half_width: of their intervals of 95 %.
-        free: which of them were fitted.
-        noise: of the tips.
-        unit: what each episode counts to.
-        left_out: what each unit costs, -2 log likelihood, by values that are fitted to all others.
-    """
+    """Values of `NAMES` that explain tracks best, with the half-widths of their intervals of 95 %, those that were
+    fitted (`free`), the noise of the tips, what each episode counts to (`unit`), and what each unit costs, -2 log
+    likelihood, by values that are fitted to all others."""
 
     values: Float[np.ndarray, "values"]
     half_width: Float[np.ndarray, "values"]
@@ -166,14 +143,8 @@ def earns(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"]
 def fit_drive(
     tracks: Tracks, unit: Int[np.ndarray, "episodes"], begin: DriveFit | None = None, layer: str = ""
 ) -> DriveFit:
-    """Fit gain, play and lag to tracks, and what more is asked for.
-
-    Args:
-        tracks: of episodes.
-        unit: what each episode counts to: its log, or itself.
-        begin: what the fit begins with, whose layers are fitted too; the best of a grid if not given.
-        layer: "slip" or "slack", to be fitted with them.
-    """
+    """Fit gain, play and lag to tracks, and a layer, "slip" or "slack", if one is named. `unit` is what each episode
+    counts to, its log or itself; the fit goes on from `begin` with its layers, or from the best of a grid."""
     free = np.array([k < 3 or name == layer for k, name in enumerate(NAMES)])
     free |= False if begin is None else begin.free
     some, fits = np.unique(np.linspace(0, len(unit) - 1, 8).astype(int)), []
@@ -212,10 +183,8 @@ def _converged(
 def _left_out(
     found: Filtered, slope: Float[np.ndarray, "episodes tips values"], unit: Int[np.ndarray, "episodes"]
 ) -> tuple[Float[np.ndarray, "values"], Float[np.ndarray, "units"]]:
-    """Return half the intervals of 95 %, and what each unit costs that is left out.
-
-    Standard errors are the jackknife's, and no less than innovations make them that are independent.
-    """
+    """Return half the intervals of 95 %, and what each unit costs that is left out. Standard errors are the
+    jackknife's, and no less than independent innovations make them."""
     units = unit.max() + 1
     information, score = np.zeros((units, len(NAMES), len(NAMES))), np.zeros((units, len(NAMES)))
     np.add.at(information, unit, np.einsum("eti,etj->eij", slope, slope))
@@ -272,10 +241,8 @@ def fit_noise(
 def led(
     tracks: Tracks, robot: RobotConfig
 ) -> tuple[Float[np.ndarray, "episodes tips"], Filtered, Float[np.ndarray, "episodes"], Noise]:
-    """Return where a robot's drive alone leads tips after those that tracks have, Δtip, mm, with what made it so.
-
-    That is the filter of the tips that were seen, where in its play each device begins, and the noise of the tips.
-    """
+    """Return where a robot's drive alone leads tips after those that tracks have, Δtip, mm, with the filter of the tips
+    that were seen, where in its play each device begins, and the noise of the tips."""
     drive = robot.wire
     values = np.array([drive.gain_translation, drive.play_mm, robot.latency_s, 0.0, 0.0])
     noise = fit_noise(tracks, values, starts(tracks, values[None], _NOISES[0])[0][0], _NOISES[0])

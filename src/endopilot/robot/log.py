@@ -41,20 +41,11 @@ _BESIDE_MM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """What a robot was asked for, and what was seen of its wire. NaN where a row says nothing.
+    """What a robot was asked for, and what was seen of its wire, a row for each moment; NaN where it says nothing.
 
-    Attributes:
-        name: of the log.
-        time_s: of each row, s.
-        episode: number of the episode that each row belongs to.
-        command: positions that the drives were sent to, mm and rad, of each device.
-        encoders: what encoders read, mm and rad.
-        load: force (N) and torque (N·mm) of the drives.
-        tip: the wire's tip as it was seen, LPS mm; from a pixel once the vessel is known (`in_vessel`).
-        pixel: column and row that showed it.
-        used: whether what was seen is to be used.
-        camera: what pixels belong to; None where tips were seen in space.
-        by_velocity: whether the drives were sent along by velocity, and `command` is what these sum up to.
+    The command is where the drive of each device was sent to, mm and rad, or, `by_velocity`, what its velocities sum up
+    to; encoders read mm and rad, loads are N and N·mm. The wire's tip was seen in space, LPS mm, or by a camera as a
+    pixel, column and row, and in space once the vessel is known (`in_vessel`); `used` says whether that counts.
     """
 
     name: str
@@ -84,11 +75,8 @@ class RobotLog:
         return self.used & (np.isfinite(self.tip).all(axis=1) | np.isfinite(self.pixel).all(axis=1))
 
     def in_vessel(self, tree: VesselTree) -> RobotLog:
-        """Return the log with the tip of each pixel where its ray passes nearest to a vessel's centerlines.
-
-        Raises:
-            InputError: half of the tips lie beside the vessel: they are of another vessel, frame or unit.
-        """
+        """Return the log with the tip of each pixel where its ray passes nearest to a vessel's centerlines; InputError
+        where half of the tips lie beside the vessel: they are of another vessel, frame or unit."""
         vessel = KDTree(tree.line.points)
 
         def beside_mm(tips: Float[np.ndarray, "n 3"]) -> float:
@@ -152,16 +140,9 @@ class RobotLog:
 
 
 def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence[str] = ()) -> RobotLog:
-    """Read a robot's log.
-
-    Args:
-        path: the CSV file, or a ROS bag.
-        camera: what its pixels belong to; that of `camera.yaml` beside it if not given.
-        topics: of a bag, PART=TOPIC (`robot.bag.read_bag`).
-
-    Raises:
-        InputError: no such table, or no camera for its pixels; the line names file, row, column and mend.
-    """
+    """Read a robot's log, a CSV file, or a ROS bag, of which `topics` are PART=TOPIC (`robot.bag.read_bag`). The camera
+    of its pixels is that of `camera.yaml` beside it if none is given. InputError for no such table, or no camera, names
+    file, row, column and mend."""
     path = Path(path)
     prefixes = column_prefixes(_MOST_DEVICES)
     of_devices = [p + name for p in prefixes for name in (*_POSITION, *_VELOCITY, *_ENCODER, *_LOAD)]
@@ -250,14 +231,9 @@ def _command(
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The commands of episodes, and the times at which the tip was seen, padded to one length.
-
-    Attributes:
-        knot_s: times from the start of each episode at which the drive reaches what was commanded, s.
-        command: what it reaches then, mm and rad from the first command; device 0.
-        seen_s: times at which the tip was seen, s; the last one again as padding.
-        seen: which of them are no padding.
-    """
+    """The commands of episodes, and the times at which the tip was seen, padded to one length: times from the start of
+    each episode at which the drive reaches what was commanded (`knot_s`), mm and rad from the first command, and those
+    at which the tip was seen (`seen_s`), of which `seen` are no padding."""
 
     knot_s: Float[np.ndarray, "episodes knots"]
     command: Float[np.ndarray, "episodes knots 2"]
@@ -266,11 +242,9 @@ class Courses:
 
     @staticmethod
     def of(episodes: Sequence[RobotLog], drive: DriveConfig) -> Courses:
-        """Take them from logs of one episode each, with a command and a tip at least.
-
-        A drive that is sent along by velocity ramps from one to the next, and is behind by what a ramp costs for ever
-        after; one that is sent to a position gets there.
-        """
+        """Take them from logs of one episode each, with a command and a tip at least. A drive that is sent along by
+        velocity ramps from one to the next, and stays behind by what a ramp costs; one that is sent to a position gets
+        there."""
         acceleration = np.array([drive.max_acceleration_mm_s2, drive.max_acceleration_rad_s2])
         knots = max(int(log.commanded.sum()) for log in episodes) + 1
         tips = max(int(log.seen.sum()) for log in episodes)
@@ -303,16 +277,9 @@ class Courses:
         play: Float[np.ndarray, "candidates"],
         start: float | Float[np.ndarray, "*candidates episodes"] = 0.0,
     ) -> Float[np.ndarray, "candidates episodes times"]:
-        """Return where the device's proximal end is, from where it was at the first command, mm or rad.
-
-        Args:
-            axis: 0 for the translation, 1 for the rotation.
-            at_s: times of each episode, s.
-            latency_s: from a command to the motion, s.
-            gain: motion of the device per motion of the drive.
-            play: motion that is lost where the drive reverses, mm or rad.
-            start: where in the play the device of each episode begins: -1 it was pushed last, 1 it was pulled last.
-        """
+        """Return where the device's proximal end is at times of each episode, from where it was at the first command,
+        mm (axis 0) or rad (axis 1), by latency, gain, and the play that is lost where the drive reverses, in which each
+        begins at `start`: -1 it was pushed last, 1 it was pulled last."""
         drive = gain[:, None, None] * self.command[None, :, :, axis]
         half = play[:, None] / 2
         ahead = np.empty_like(drive)  # of the device

@@ -29,25 +29,13 @@ ANSWER_S = 2.0
 
 class RemoteRobot:
     """Commands a drive process, and reads its encoders, which sit at the motor, and its load. Any thread may call it.
-    A call raises InputError once the connection is lost.
-
-    Attributes:
-        limits: of the drive, as it reported them; no command beyond them is ever sent.
-        status: "armed", or "stopped:" and why, as the drive last said.
-    """
+    A call raises InputError once the connection is lost. No command beyond the `limits` that the drive reported is ever
+    sent; `status` is "armed", or "stopped:" and why, as the drive last said."""
 
     def __init__(self, host: str, port: int, certificates: Path) -> None:
-        """Connect and arm the drive.
-
-        Args:
-            host: where the drive listens.
-            port: its TCP port.
-            certificates: folder with `client.key`, `client.crt` and `drive.crt`.
-
-        Raises:
-            InputError: a file is missing or bad; nothing listens there, it is no drive or another one, it does not know
-                this client, or it has another client.
-        """
+        """Connect and arm the drive, with `client.key`, `client.crt` and `drive.crt` of a folder. InputError where a
+        file is missing or bad, nothing listens there, or what does is another drive, does not know this client, or has
+        one."""
         context = tls_context(Path(certificates), of_drive=False)
         self._where, self._lock = f"{host}:{port}", threading.RLock()
         self._lost, self.status = "", "stopped:start"
@@ -58,7 +46,7 @@ class RemoteRobot:
             self.limits = self._greet(Path(certificates))
             self.arm()
         except BaseException:
-            self._socket.close()
+            self._lose("it was refused")
             raise
         self._living = threading.Thread(target=self._live, daemon=True)
         self._living.start()
@@ -193,6 +181,7 @@ class RemoteRobot:
 
     def _lose(self, reason: str) -> None:
         self._lost = self._lost or reason
+        self._lines.close()  # a socket stays open as long as a file on it
         self._socket.close()
 
     def _gone(self) -> InputError:

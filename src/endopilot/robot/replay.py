@@ -68,14 +68,10 @@ class ReplayConfig:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeReplay:
-    """One episode, seen and simulated.
+    """One episode, seen and simulated: when the tip was seen, by the log's clock, s, where it was and where the
+    simulated one was, LPS mm, with their branches. Tips that are `given` say where the wire lies, others are predicted.
 
     Attributes:
-        number: of the episode in its log.
-        time_s: at which the tip was seen, by the log's clock, s.
-        given: which of the tips say where the wire lies; the others were predicted.
-        seen: the real tip, LPS mm.
-        simulated: the simulated tip at the same times, LPS mm.
         predicted: where the tip is expected, LPS mm: beside where kinematics lead it in the simulated tip's branch, or
             beside the simulated tip, by what tips before were; as simulated while given.
         abscissa: Δtip of both, seen and simulated, mm.
@@ -83,7 +79,6 @@ class EpisodeReplay:
         in_view: the difference of the predicted tip from the real one, as the camera sees it, mm.
         core_mm: distance of the simulated tip from the real one, likewise.
         along: unit vector along the vessel at the real tip.
-        branch: of both tips.
         force: of the drive, N, as the log has it and simulated, at each of its readings after the first tip.
         rotation_rad: φ that the simulated wire began with.
         rotation_known_rad: rotations no farther from it than this are as good, as what was given tells; NaN where it
@@ -134,14 +129,8 @@ class Prepared:
 
 
 def usable_episodes(logs: Sequence[RobotLog], anatomy: Anatomy) -> list[RobotLog]:
-    """Return the episodes that can be replayed, with tips in space, from the last command before the first tip on.
-
-    What a drive did before that, such as a retraction to where an episode begins, tells nothing of where in its play
-    the wire lies: nobody saw whether the wire followed.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the episodes that can be replayed, with tips in space, from the last command before the first tip on:
+    nobody saw whether the wire followed what a drive did before. InputError where there is none."""
     found = [episode for log in logs for episode in log.in_vessel(anatomy.tree).episodes()]
     found = [each.from_row(_first_row(each)) for each in found if each.seen.sum() >= LEAST_TIPS]
     found = [each for each in found if each.commanded.sum() > 1]
@@ -166,29 +155,16 @@ def replay_log(
     robot: RobotConfig,
     config: ReplayConfig | None = None,
 ) -> list[EpisodeReplay]:
-    """Replay logs.
-
-    Args:
-        logs: what a robot was asked for, and what was seen.
-        anatomy: the vessel.
-        device: the wire.
-        robot: latency, gains and plays of the drive.
-        config: what is given, and which starts are tried.
-
-    Raises:
-        InputError: no episode shows the tip often enough.
-    """
+    """Replay logs: what a robot, by its latency, gains and plays, makes of their commands with a wire in a vessel;
+    InputError where no episode shows the tip often enough."""
     config = config or ReplayConfig()
     prepared = prepare(usable_episodes(logs, anatomy), anatomy, config.given, robot)
     return replay_prepared(prepared, device, robot, config)
 
 
 def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotConfig) -> Prepared:
-    """Project what was seen in episodes onto a vessel, once for many replays.
-
-    Raises:
-        InputError: a drive goes too far: in another unit.
-    """
+    """Project what was seen in episodes onto a vessel, once for many replays; InputError where a drive goes too far: in
+    another unit."""
     longest_mm = float(anatomy.tree.longest_path().abscissa[-1])
     for log in logs:
         if (travel := float(np.ptp(log.command[log.commanded, 0, 0]))) > longest_mm + _TRAVEL_MM:
@@ -300,10 +276,8 @@ def _proximal(
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Worlds of each episode: their tips where the real one was seen, and how far they were from it while given.
-
-    Forces are those of the drive at the ends of periods, N; NaN beyond an episode's end.
-    """
+    """Worlds of each episode: their tips where the real one was seen, how far they were from it while given, and the
+    drive's force at the ends of periods, N; NaN beyond an episode's end."""
 
     tip: Float[np.ndarray, "episodes worlds tips 3"]
     abscissa: Float[np.ndarray, "episodes worlds tips"]
@@ -351,10 +325,8 @@ def _simulated(
 
 
 def _costs(of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"]) -> Float[np.ndarray, "episodes worlds"]:
-    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm.
-
-    The last tips count most: where the wire lies when the prediction begins matters, not how it came there.
-    """
+    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm. The last
+    ones count most: where the wire lies when the prediction begins matters."""
     far = [_far_from(of, tip, k, of.given) for k in range(len(tip))]
     weights = [np.exp(-np.arange(each.shape[1])[::-1] / each.shape[1] / _FADES) for each in far]
     return np.stack([np.average(each, axis=1, weights=w) for each, w in zip(far, weights, strict=True)])
@@ -371,10 +343,7 @@ def _far_from(
 
 def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "episodes worlds"]:
     """Return how likely the worlds of each episode are: by its given tips, and by how the log's episodes before ended.
-
-    A wire that nobody clamped anew keeps its rotation on the drive. Whether that is so is told by how well the
-    rotations so far were foretold.
-    """
+    A wire that nobody clamped anew keeps its rotation on the drive, as the rotations so far tell."""
     found, count, before = np.empty((len(of.logs), len(angles))), len(angles), ""
     known, trust = np.empty(count), 0.0
     for k, log in enumerate(of.logs):
@@ -394,12 +363,8 @@ def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) ->
 
 
 def _known_rotation(far: Float[np.ndarray, "worlds given"], angles: Float[np.ndarray, "worlds"]) -> float:
-    """Return half the arc of the rotations that are as good as the best, rad; NaN where that is most of a turn.
-
-    Args:
-        far: how far the tips of worlds are from the real ones, mm.
-        angles: equal ones, that the worlds began with, rad.
-    """
+    """Return half the arc of the rotations that are as good as the best, rad, by how far the tips of worlds, which
+    began with equal angles, are from the real ones, mm; NaN where that is most of a turn."""
     parts = [part.sum(axis=1) for part in np.array_split(far, LEAST_EPISODES, axis=1)]
     good = Candidates({}, angles[:, None], np.stack(parts, axis=1)).as_good
     gaps = np.diff(np.flatnonzero(np.tile(good, 2))[: good.sum() + 1])

@@ -25,14 +25,9 @@ BACKS_OUT_MM_S = 5.0
 
 @dataclass(frozen=True)
 class ProximalState:
-    """What a robot measures, of the wire and then of each catheter from the inside out.
-
-    Attributes:
-        time_s: by the robot's clock, s.
-        devices: inserted length Δ (mm) and rotation φ (rad, unwrapped) as the encoders have them.
-        load: axial force (N, positive when it pushes) and torque (N·mm) of each drive; empty for a robot that measures
-            none.
-    """
+    """What a robot measures at a time by its clock, of the wire and then of each catheter from the inside out: inserted
+    length Δ (mm) and rotation φ (rad, unwrapped) as the encoders have them, and axial force (N, positive when it
+    pushes) and torque (N·mm) of each drive, if it measures these."""
 
     time_s: float
     devices: Proximals
@@ -44,12 +39,9 @@ class Robot(Protocol):
     """A robot that drives a wire, and the catheters around it if it has drives for them."""
 
     def command(self, devices: Proximals) -> Proximals:
-        """Move on until the next command, and return what is made of it: a pair for each device.
-
-        Args:
-            devices: mm/s and rad/s of the wire, then of each catheter. What is not finite stops that device, what is
-                beyond its drive's limits is cut off; a device that is not given stops.
-        """
+        """Move on until the next command, mm/s and rad/s of the wire, then of each catheter, and return what is made of
+        it. What is not finite stops that device, what is beyond its drive's limits is cut off; a device that is not
+        given stops."""
         ...
 
     def proximal_state(self) -> ProximalState:
@@ -58,12 +50,8 @@ class Robot(Protocol):
 
 
 class SimulatedRobot:
-    """A robot whose wire, and catheters if it has any, are the one world of a simulator. Each device has its own drive.
-
-    Attributes:
-        recorder: what the devices were asked for and did in each cycle so far, as it truly was.
-        last_step: what the devices did in the drives' last cycle; None before the first.
-    """
+    """A robot whose wire, and catheters if it has any, are the one world of a simulator, each with a drive of its own.
+    `recorder` has what they were asked for and truly did in each cycle, `last_step` what in the last; None before."""
 
     def __init__(
         self,
@@ -76,17 +64,9 @@ class SimulatedRobot:
         backs_out: tuple[float, float] = (0.0, 0.0),
         cycle_s: float = CYCLE_S,
     ) -> None:
-        """Grasp the devices where they are.
-
-        Args:
-            simulator: of one world, driven by velocity.
-            limits: of the drive of the wire, then of each catheter's.
-            config: latency, gains, plays, encoders and noise.
-            seed: of the gains, the jitter and the noise.
-            ostium_mm: the true inserted lengths are this much more than the encoders', mm.
-            backs_out: after how many seconds the guiding catheter backs out of the ostium, and by how much, mm.
-            cycle_s: period of the drives' loop, s.
-        """
+        """Grasp the devices of a simulator's one world, driven by velocity, with drives of some limits, the wire's
+        first, and gains, jitter and noise that `seed` draws. True inserted lengths are `ostium_mm` more than the
+        encoders'; the guiding catheter `backs_out` of the ostium after some seconds, by some mm."""
         self._simulator, self._limits, self._random = simulator, tuple(limits), np.random.default_rng([seed, 1])
         counted = [limit.by_encoder(ostium_mm) for limit in limits]
         self._robots = Robots(simulator, config or RobotConfig(), [counted], seeds=[[seed]], ostium_mm=ostium_mm)
@@ -156,9 +136,7 @@ class SimulatedRobot:
 
     @property
     def measured(self) -> dict[str, Float[np.ndarray, "1 cycles devices 2"]]:
-        """What was measured at the end of each cycle, as columns of the recorder's trajectory.
-
-        `encoders` holds inserted length, mm, and rotation, rad; `load` axial force, N, and torque, N·mm.
-        """
+        """What was measured at the end of each cycle, as columns of the recorder's trajectory: `encoders` (mm, rad) and
+        `load` (N, N·mm)."""
         read = np.array(self._readings).reshape(1, -1, len(self._limits), 4)
         return {"encoders": read[..., :2], "load": read[..., 2:]}
