@@ -27,7 +27,7 @@ from endopilot.xray.detector import Exposure, Signal, TipDetector, own_share
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
-from endopilot.xray.tip_filter import TipLocation
+from endopilot.xray.tip_filter import TipLocation, located
 from endopilot.xray.tip_posterior import LocateConfig, TipEstimate, told_by_later
 from endopilot.xray.vessel_grid import VesselGrid
 
@@ -127,7 +127,7 @@ def locate_in_images(
             continue
         at = project(one.position[None])
         tips.append(
-            TipLocation.of(
+            located(
                 anatomy.tree, frame, one, (int(at.branch[0]), float(at.abscissa[0])), moved_mm=moved, residual_mm=np.nan
             )
         )

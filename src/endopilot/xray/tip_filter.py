@@ -96,19 +96,20 @@ class TipLocation:
     residual_mm: float
 
     @classmethod
-    def of(cls, tree: VesselTree, frame: int, found: TipEstimate, place: tuple[int, float], **rest: Any) -> TipLocation:
-        """Return a location, given branch and abscissa, mm, of the place, and how the vessel and the line lie."""
-        branch, abscissa = place
-        line = tree.branches[branch]
-        section = tree.section_names[line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]]
-        seen = (frame, found.status, found.position, found.covariance, found.share)
-        return cls(*seen, abscissa, branch, section, **rest)
-
-    @classmethod
     def nowhere(cls, frame: int) -> TipLocation:
         """Return that a frame shows no tip."""
         nothing = np.full(3, np.nan)
         return cls(frame, "not found", nothing, np.full((3, 3), np.nan), 0.0, np.nan, -1, "", nothing, np.nan)
+
+
+def located(tree: VesselTree, frame: int, found: TipEstimate, place: tuple[int, float], **rest: Any) -> TipLocation:
+    """Return a location, given branch and abscissa, mm, of the place, and how the vessel and the line lie."""
+    branch, abscissa = place
+    line = tree.branches[branch]
+    section = tree.section_names[line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]]
+    return TipLocation(
+        frame, found.status, found.position, found.covariance, found.share, abscissa, branch, section, **rest
+    )
 
 
 class _Fit(NamedTuple):
@@ -310,7 +311,7 @@ class TipFilter:
         near = places[np.linalg.norm(self.grid.middle[places] - self.grid.middle[found.mode], axis=1) <= _NEAR_MM]
         place = near[np.linalg.norm(self.grid.middle[near] - found.position, axis=1).argmin()]
         best = np.searchsorted(places, found.mode)
-        return TipLocation.of(
+        return located(
             self._tree,
             seen.frame,
             found if found.share >= _SURE else replace(found, status="ambiguous"),
