@@ -139,9 +139,7 @@ class Pilot:
         motions = [Motion(pull, turn, pull + push) for pull in pulls for turn in turns]
         self.back_mm = 0.0
         wires = [self.wires[i] for i in likeliest]
-        trials = endopilot.Simulator(
-            self.navigation.anatomy, wires * len(motions), config=COARSE, sharing=[self.belief]
-        )
+        trials = endopilot.Simulator(self.navigation.anatomy, wires * len(motions), config=COARSE)
         trials.copy_worlds(np.tile(likeliest, len(motions)), of=self.belief)
         controls = [motion.controls() for motion in motions]
         longest = max(map(len, controls))

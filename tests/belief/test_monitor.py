@@ -145,7 +145,7 @@ def test_a_play_that_the_encoders_do_not_see_is_noticed_and_identified(along_the
     """2.5 mm: tip and band are right after the wire has turned back, and the play is stated."""
     robot = RobotConfig(encoders_at="motor", wire=DriveConfig(play_mm=2.5))
     at = list[float]()
-    for policy, loop in driven(replace(along_the_fork, seconds=20.0), World(robot=robot), kind=Rocks):
+    for policy, loop in driven(replace(along_the_fork, seconds=20.0), World(robot=robot), seed=2, kind=Rocks):
         found = policy.last.found
         at.append(float(loop.simulator.project().abscissa[0, 0]))
     assert policy.monitor.belief.drives.unknown and "the wire is not where its encoder says" in found
