@@ -76,9 +76,9 @@ def _tables() -> Iterator[str]:
         tables.setdefault(json_text(submission.key), []).append((submission.key, row))
     for rows in sorted(tables.values(), key=lambda rows: _place(rows[0][0])):
         key = rows[0][0]
-        drawn = ", test patients" * (key["split"] == "test")
+        drawn = " drawn for the test" * (key["split"] == "test")
         some = f", {len(key['done'])} tasks" * (len(key["done"]) < len(list_tasks(key["ladder"])))
-        title = TITLES.get(key["ladder"], key["ladder"])
+        title = f"{TITLES.get(key['ladder'], key['ladder'])}, {max(key['done'].values())} patients"
         yield from (f"### {title}{drawn}{some}", "", f"Key: {terms_in_words(key)}.", "")
         yield from (_line(*HEAD), "|" + "---|" * len(HEAD))
         yield from (line for _, line in sorted((row for _, row in rows), reverse=True))
