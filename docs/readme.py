@@ -152,12 +152,12 @@ def stands() -> str:
         (
             "own tasks",
             f"ladder, version 2: {agent.split()[0]} % of 240 navigations are safe",
-            "in others' simulators",
+            "elsewhere",
             [("ladder", "#version-2")],
         ),
         (
             "tasks of others",
-            "stEVE_bench, within 5 mm, in our simulator: "
+            "stEVE_bench, within 5 mm, in our simulator, earlier search: "
             + ", ".join(f"{task} {row[2]} % of {row[-1]}" for task, row in ours.items())
             + f"; learned controllers in its own {' and '.join(theirs[task][2] for task in ours)} %",
             "in its simulator; with hospital devices",
