@@ -37,7 +37,7 @@ from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, l
 
 KindName = Literal["assumed", "images", "coaxial"]
 LEVEL, ONSET, EXPOSED_EVERY, SECONDS = 0.9, 0.2, 20, 30.0
-"""Share of the intervals that the bands shall cover; how likely an unseen contact may be; periods of 0.5 s between
+"""Share of the intervals that the bands shall cover; how likely an unseen event may be; periods of 0.5 s between
 exposures; seconds of a navigation."""
 
 

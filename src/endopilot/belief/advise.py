@@ -167,9 +167,9 @@ def _picture(content: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot()
         axes.plot([0.0, monitoring.periodic_per_minute(0.0)], [100.0, 0.0], color=GREY, label="Periodic imaging")
         curve = [(each["exposures_per_minute"], 100 * each["missed_share"]) for each in content["curves"]["adviser"]]
-        label = "Contacts surer or less sure, calibration patients"
+        label = "Probabilities from which X-ray is due, calibration patients"
         axes.plot(*zip(*curve, strict=True), color=BLUE, marker="o", markersize=3.5, label=label)
-        at, label = content["adviser"], f"New patients, contacts likelier than {content['calibration'].onset:g}"
+        at, label = content["adviser"], f"New patients, X-ray due from {content['calibration'].onset:g}"
         axes.plot(
             at["exposures_per_minute"], 100 * at["missed_share"], "o", color=VERMILLION, markersize=9, label=label
         )

@@ -31,7 +31,7 @@ from endopilot.xray.moving_patient import seen_in_episodes, turned
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
 ONSETS = (0.05, 0.1, 0.2, 0.3, 0.5)
-"""How likely an unseen contact may be: what is tried when an adviser is calibrated."""
+"""How likely an unseen event may be: what is tried when an adviser is calibrated."""
 
 
 @settings
@@ -260,7 +260,7 @@ def calibrate(fitted: Sequence[Followed], own: Sequence[Followed], level: float,
 def greatest_onset(
     measured: Callable[[Calibration], Sequence[Followed]], bands: Calibration, missed: float
 ) -> tuple[float, list[dict[str, float]]]:
-    """Return how likely an unseen contact may be before X-ray is due, for a share of the events to be surely missed.
+    """Return how likely an unseen event may be before X-ray is due, for a share of the events to be surely missed.
 
     Those of `ONSETS` are tried from the least on. The last one before the first that misses too many is taken, so that
     chance among many favours none; the least, where it misses too many too.

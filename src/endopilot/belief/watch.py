@@ -112,7 +112,7 @@ _ALWAYS = 3
 _STILL_MM = 0.1
 """Where neither tip nor proximal end has moved by more since an exposure, mm, another shows the same."""
 _SOFT_MM = 0.03
-"""Least standard deviation of how far a tip is from τ, mm: the lumen's radius is read off a line that is smoothed."""
+"""Added to the standard deviation of how far a tip is from τ, mm: the lumen's radius is read off a smoothed line."""
 _PRESSES = np.array([0.8, 1.0, 1.25])
 """Shares of the largest force that the wall may press with, by simulated wires and the drive's load, at which it is
 looked at: both ends of the band, for they err by a fifth, as wires do, and its middle."""
@@ -135,7 +135,6 @@ class Watch:
     Attributes:
         innovations: what exposures showed of the predictions.
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm.
-        onset: how likely the tip came to the wall within the last period, unseen, at that call.
         held_mm: by how much the wire was moved while its tip rested, since the last exposure, mm.
     """
 
@@ -154,7 +153,7 @@ class Watch:
         self._ends_mm, self._width_mm, self.held_mm = np.array([at.proximal[0], *at.tip]), 0.0, 0.0
         self._moved_mm, self._wide, self._late, self._presses = 0.0, False, False, 0
         self.half_width = self._half = self._widths(at.spread, np.zeros(2))
-        self._at_wall, self.onset = float(ndtr(-self._from_wall(at))), 0.0
+        self._at_wall = float(ndtr(-self._from_wall(at)))
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
@@ -196,11 +195,11 @@ class Watch:
         self._wide = bool(2 * ndtr(-self._config.abscissa_mm * _WITHIN / max(half[0], 1e-9)) >= self._calibration.onset)
         self._late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
         self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
-        self.onset = 0.0
+        comes = 0.0
         if self._periods > 1:  # else X-ray shows it
             before, self._at_wall = self._at_wall, float(ndtr(-self._from_wall(at)))
-            self.onset = self._at_wall * (1 - before)
-        due = self.onset >= self._calibration.onset or self._wide or self._late or self._presses > pressed_before
+            comes = self._at_wall * (1 - before)
+        due = comes >= self._calibration.onset or self._wide or self._late or self._presses > pressed_before
         due = due or (self.innovations.alarm and self._periods >= _ALWAYS)
         due = due and self._periods > 1 and self._moved_mm > _STILL_MM
         if due:
