@@ -2,7 +2,7 @@
 
 `python docs/leaderboard.py` leaves with exit code 1, and the page as it was, if a file is not confirmed. With `--climb`
 the shipped policies climb again first, as many tasks and patients as their files have: a change of theirs asks for it.
-With OPENBLAS_CORETYPE=Haswell the files can be judged on most machines.
+Files with the first of `KERNELS` can be judged on most machines.
 """
 
 from __future__ import annotations

@@ -216,7 +216,7 @@ def _of_mkl(content: dict) -> None:
 
 
 def _of_another_kernel(content: dict) -> None:
-    content["blas"] = next(kernel for kernel in submission.KERNELS if kernel != submission.blas_kernel())
+    content["blas"] = next(kernel for kernel in submission.KERNELS if kernel != submission.kernels())
     _first(content)["peak_force_n"] *= 0.97
     _score(content)
 
@@ -259,7 +259,7 @@ def looking(tmp_path_factory) -> dict:
     ("forge", "said"),
     [
         (_made_up, "seconds is 0.5 in the file and "),
-        (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell or openblas SkylakeX"),
+        (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell, numpy X86_V3 or with openblas SkylakeX, "),
         (_of_another_kernel, None),  # or this machine lacks the kernel
         (_without_exposures, "retract-rotate decides otherwise"),
         (_of_a_better_hand, "retract-rotate decides otherwise"),
@@ -315,10 +315,11 @@ def test_thinking_is_charged_told_and_a_term_of_its_own(tmp_path):
 
 
 def test_a_kernel_that_this_machine_lacks_is_not_judged(looking, check, monkeypatch):
-    monkeypatch.setitem(submission.KERNELS, "openblas Loongson", "avx1024")
-    found = check(looking | {"blas": "openblas Loongson"})
+    monkeypatch.setitem(submission.KERNELS, "openblas Loongson, numpy X86_V3", ("avx1024", {}))
+    found = check(looking | {"blas": "openblas Loongson, numpy X86_V3"})
     assert (found.verdict, found.confirmed, found.scores) == ("not judged", False, ())
-    assert found.remarks == ("this machine does not run openblas Loongson: nothing was driven again",)
+    said = "this machine does not run openblas Loongson, numpy X86_V3: nothing was driven again"
+    assert found.remarks == (said,)
 
 
 def test_other_versions_are_stated_and_buy_nothing(changed):

@@ -18,6 +18,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
+from numpy.lib.introspect import opt_func_info
 from threadpoolctl import threadpool_info
 
 from endopilot import _core
@@ -34,10 +35,16 @@ from endopilot.simulation.world import World
 from endopilot.tasks.task import LadderVersion, Task, find_task
 
 SUBMISSION_FILE = "submission.json"
-KERNELS = {"openblas Haswell": "avx2", "openblas SkylakeX": "avx512"}
-"""Kernels of linear algebra that submissions are driven again with, and the processor level that each needs. Vessels
-differ by the kernel in their last bits, and so does what is driven in them: a wire that snaps makes that up to 3.4 % of
-a force."""
+KERNELS = {
+    "openblas Haswell, numpy X86_V3": (
+        "avx2",
+        {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"},
+    ),
+    "openblas SkylakeX, numpy X86_V4": ("avx512", {"OPENBLAS_CORETYPE": "SkylakeX", "NPY_DISABLE_CPU_FEATURES": ""}),
+}
+"""Kernels of linear algebra and of numpy's functions that submissions are driven again with, the processor level that
+they need, and the variables by which libraries take them as they are loaded. Vessels differ by the kernel in their last
+bits, and so does what is driven in them: a wire that snaps makes that up to 3.4 % of a force."""
 MOST_PATIENTS = 100
 """Patients of each task, at most: their seeds are distinct up to there (`navigation_seed`)."""
 
@@ -83,7 +90,7 @@ class Submission:
 
     `key` must be equal for two files to be compared (`key_of`); it follows from all else here. `origin` is the package
     and version of the policy, or its file and the SHA-256 of that; `core` the processor level of the rod core, `blas`
-    the kernel of linear algebra, such as openblas Haswell. Nothing confirms `decision_ms`, how long decisions took, ms,
+    kernels of linear algebra and of numpy's functions (`KERNELS`). Nothing confirms `decision_ms`, how long decisions took, ms,
     median and 99th percentile: another machine takes another time."""
 
     format: Literal[1] = 1
@@ -148,11 +155,12 @@ class SubmissionCheck:
         return self.verdict in ("decided again", "replayed")
 
 
-def blas_kernel() -> str | None:
-    """Return which kernel of linear algebra numpy and SciPy run here, such as openblas Haswell; None if not told."""
+def kernels() -> str:
+    """Return which kernels of linear algebra and of numpy's functions run here, as in `KERNELS`."""
     loaded = [each for each in threadpool_info() if each["user_api"] == "blas"]
-    kernels = {f"{each['internal_api']} {each.get('architecture', '')}".strip() for each in loaded}
-    return ", ".join(sorted(kernels)) or None
+    blas = {f"{each['internal_api']} {each.get('architecture', '')}".strip() for each in loaded}
+    (exp,) = opt_func_info(func_name="^exp$", signature="float64")["exp"].values()
+    return ", ".join([*sorted(blas), f"numpy {exp['current']}"])
 
 
 def write_submission(
@@ -173,7 +181,7 @@ def write_submission(
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
         core=_core.LEVEL,
-        blas=blas_kernel(),
+        blas=kernels(),
         tasks={name: task_digest(find_task(name, version=terms.version)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
@@ -238,9 +246,10 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
     submission = read_submission(path)
     kernel, at_hand = submission.blas or "none", submission.policy in (*POLICIES.shipped, policy)
     if kernel not in KERNELS:
+        _, variables = next(iter(KERNELS.values()))
         raise InputError(
-            f"{path}: blas: {kernel}; submissions are driven again with {' or '.join(KERNELS)}: run the ladder again "
-            "with OPENBLAS_CORETYPE=Haswell"
+            f"{path}: blas: {kernel}; submissions are driven again with {' or with '.join(KERNELS)}: run the ladder "
+            f"again with {' '.join(f'{name}={value!r}' for name, value in variables.items())}"
         )
     remark = f"this machine does not run {kernel}: nothing was driven again"
     found: dict[str, Any] = {"verdict": "not judged", "difference": None, "scores": (), "remarks": (remark,)}
@@ -258,29 +267,31 @@ def check_submission(path: str | Path, *, policy: str = "") -> SubmissionCheck:
 
 
 @contextmanager
-def _running(kernel: str) -> Iterator[tuple[bool, Workers | None]]:
-    """Yield whether this machine runs a kernel of linear algebra, and processes that do, unless this one does."""
-    if kernel == blas_kernel():
+def _running(name: str) -> Iterator[tuple[bool, Workers | None]]:
+    """Yield whether this machine runs kernels, and processes that do, unless this one does."""
+    if name == kernels():
         yield True, None
         return
-    before = os.environ.get("OPENBLAS_CORETYPE")
-    os.environ["OPENBLAS_CORETYPE"] = kernel.partition(" ")[2]  # which OpenBLAS reads as it is loaded
+    level, variables = KERNELS[name]
+    before = {each: os.environ.get(each) for each in variables}
+    os.environ |= variables
     try:
         with Workers() as pool:
             runs = False
-            if KERNELS[kernel] in _core.supported_levels():
+            if level in _core.supported_levels():
                 with suppress(BrokenProcessPool):  # some libraries do not let their kernel be chosen
-                    runs = pool.submit(blas_kernel).result() == kernel
+                    runs = pool.submit(kernels).result() == name
             yield runs, pool
     finally:
-        del os.environ["OPENBLAS_CORETYPE"]
-        os.environ |= {} if before is None else {"OPENBLAS_CORETYPE": before}
+        for each, value in before.items():
+            os.environ.pop(each)
+            os.environ |= {} if value is None else {each: value}
 
 
 def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at_hand: bool) -> dict[str, Any]:
     """Return verdict, first difference, scores and remarks of `SubmissionCheck`."""
     terms, policy = submission.terms, submission.policy
-    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": blas_kernel()}
+    here = {**manifest(config=None)["versions"], "core": _core.LEVEL, "blas": kernels()}
     made = {**submission.versions, "core": submission.core, "blas": submission.blas}
     remarks = [f"made with {of} {made.get(of)}, checked with {now}" for of, now in here.items() if made.get(of) != now]
     tasks = sorted(map(terms.task, submission.navigations), key=lambda task: task.level)
