@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
-from endopilot.verification.case import (
+from endopilot.verification.free_rod import (
     STATIC,
     Case,
     Curve,

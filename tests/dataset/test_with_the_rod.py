@@ -23,7 +23,7 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.evaluation.protocols import Recorded
+from endopilot.evaluation.evaluate import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.simulate import simulate
 
