@@ -179,9 +179,8 @@ def simulate_navigations(
             step = recorder.step(commanded)
         else:
             robots.motion.command(commanded.astype(float))
-            step = recorder.step(robots.advance(SAMPLE_PERIOD_S))
-            robots.follow(simulator)
-            measured.append(np.concatenate([commanded, robots.read(simulator)], axis=-1))
+            step, read = robots.drive(simulator, SAMPLE_PERIOD_S, recorder.step)
+            measured.append(np.concatenate([commanded, read], axis=-1))
         slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
     trajectory = recorder.trajectory()

@@ -41,19 +41,15 @@ class DriveMotion:
     ) -> None:
         """Begin at rest at Δ, mm, and φ, rad, in the middle of the play, or somewhere in it if the encoders do not see
         it; gains and jitter follow from each robot's seed."""
-        robots, self._devices, _ = position.shape
+        robots = len(position)
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
-        self._latency_s, self._jitter_s = np.zeros(robots), np.zeros(robots)
-        self._acceleration, self._gain = np.zeros(position.shape), np.zeros(position.shape)
-        self._half_play, self._ahead = np.zeros(position.shape), np.zeros(position.shape)
+        self._latency_s, self._jitter_s, self._clock = np.zeros((3, robots))
+        self._acceleration, self._gain, self._half_play, self._ahead = np.zeros((4, *position.shape))
+        self._wanted, self._ramp, self.velocity, self.motor, self.position = np.zeros((5, *position.shape))
         self._random: list[np.random.Generator] = [np.random.default_rng()] * robots
-        self._grasp(range(robots), seeds, [config] * robots if isinstance(config, RobotConfig) else config)
-        self._wanted, self._ramp = np.zeros(position.shape), self._acceleration.copy()
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
-        self._clock = np.zeros(robots)
-        self.velocity = np.zeros(position.shape)
-        self.motor, self.position = np.array(position, dtype=float), np.array(position, dtype=float)
+        self.reset(range(robots), position, seeds, [config] * robots if isinstance(config, RobotConfig) else config)
 
     @property
     def time_s(self) -> float:
@@ -78,12 +74,22 @@ class DriveMotion:
         self,
         robots: Sequence[int],
         position: Float[np.ndarray, "chosen devices 2"],
-        seeds: Sequence[Sequence[int]],
+        seeds: Sequence[int | Sequence[int]],
         configs: Sequence[RobotConfig],
     ) -> None:
-        """Put other robots, drawn by their seeds, in the place of some, at rest where they are."""
-        chosen = np.asarray(robots, dtype=int)
-        self._grasp(robots, seeds, configs)
+        """Put other robots, drawn by their seeds, in the place of some, at rest where they are: gains, half the plays,
+        and how far the motors are ahead of the devices: not at all, or anywhere in the play where encoders at the
+        motors do not see it."""
+        chosen, devices = np.asarray(robots, dtype=int), position.shape[1]
+        for robot, seed, config in zip(robots, seeds, configs, strict=True):
+            self._random[robot] = random = np.random.default_rng(seed)
+            self._latency_s[robot], self._jitter_s[robot] = config.latency_s, config.jitter_s
+            self._acceleration[robot] = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")
+            self._gain[robot] = config.gains(devices, random)
+            apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
+            self._half_play[robot] = half_play = config.plays(devices, apart) / 2
+            self._ahead[robot] = apart.uniform(-1.0, 1.0, half_play.shape) * half_play * (config.encoders_at == "motor")
+        self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
         for due, velocity in self._orders:
             due[chosen], velocity[chosen] = -np.inf, 0.0
         for array in (self._wanted, self.velocity):
@@ -100,22 +106,6 @@ class DriveMotion:
             self._move((until - self._clock)[:, None, None])
             self._clock = until
         return self.position - before
-
-    def _grasp(
-        self, robots: Sequence[int], seeds: Sequence[int | Sequence[int]], configs: Sequence[RobotConfig]
-    ) -> None:
-        """Draw some robots: gains, half the plays, and how far the motors are ahead of the devices at the start: not at
-        all, or anywhere in the play where encoders at the motors do not see it."""
-        devices = self._devices
-        for robot, seed, config in zip(robots, seeds, configs, strict=True):
-            self._random[robot] = random = np.random.default_rng(seed)
-            self._latency_s[robot], self._jitter_s[robot] = config.latency_s, config.jitter_s
-            self._acceleration[robot] = config.of_drives(devices, "max_acceleration_mm_s2", "max_acceleration_rad_s2")
-            self._gain[robot] = config.gains(devices, random)
-            apart = random.spawn(1)[0]  # what is drawn from the stream stays the same
-            self._half_play[robot] = half_play = config.plays(devices, apart) / 2
-            self._ahead[robot] = apart.uniform(-1.0, 1.0, half_play.shape) * half_play * (config.encoders_at == "motor")
-        self._top = self._fastest / np.maximum(self._gain, 1.0)  # of the motors: no device goes faster than its limit
 
     def _obey(self) -> None:
         """Take what is due of each robot, and forget what all have taken."""
