@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.simulation.core import run_core
-from endopilot.simulation.tubes import TransmissionLayout
+from endopilot.simulation.rod import TransmissionLayout
 from endopilot.verification.free_rod import STATIC, X_AXIS, Case, Curve, Loading, Picture, compare, straight_rod
 
 LENGTH_MM, TWIST_N_MM2, FRICTION_N_MM_MM = 1000.0, 80.0, 2e-4

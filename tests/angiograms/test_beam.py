@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks.anatomy.analytic_lumens import forked_tree
 from endopilot.angiograms.beam import Beam, harmonised, shown
-from endopilot.angiograms.flow import Flow, Injection
-from endopilot.angiograms.twigs import grow
+from endopilot.angiograms.flow import Flow, Injection, grow
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM, without_contrast
 from endopilot.xray.carm import CArmGeometry, view_at

@@ -19,7 +19,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.trajectory import SimulatorState
 from endopilot.types import Anatomy
 
 DEVICE = read_wire("workhorse-014")

@@ -9,12 +9,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from endopilot.angiograms.beam import Beam, harmonised, shown
+from endopilot.angiograms.beam import CONTRAST_SHARE, LUMEN_MM, Beam, harmonised, shown, stroke
 from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.angiograms.draw import CineDraw, Driven, drive_devices, motion_of, patient_seed
-from endopilot.angiograms.flow import Flow
-from endopilot.angiograms.masks import CONTRAST_SHARE, LUMEN_MM, stroke
-from endopilot.angiograms.twigs import grow
+from endopilot.angiograms.flow import Flow, grow
 from endopilot.lines import length_along, places_on
 from endopilot.simulation.motion import place, relative
 from endopilot.xray.absorbers import GUIDE_WALL_MM, catheter_line, in_catheter, is_coronary

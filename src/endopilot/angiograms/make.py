@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from endopilot.angiograms.beam import CLASSES
 from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
-from endopilot.angiograms.masks import CLASSES
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS
 from endopilot.devices.device import Wire
@@ -130,7 +130,7 @@ def _make(
     if isinstance(where, Workers):
         make_missing(title, paths, partial(work, layout), where if len(paths) > 1 else None)
         return
-    from endopilot.dataset.workers import run_on_cluster  # brings the libraries of data sets
+    from endopilot.dataset.generate import run_on_cluster  # brings the libraries of data sets
 
     remote = replace(
         layout,

@@ -28,8 +28,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
 from endopilot.simulation.simulate import run_set_up
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 

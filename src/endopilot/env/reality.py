@@ -19,7 +19,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.engine_simulator import ENGINES
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import Robots, backs_out_mm, in_grip
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import Navigation
 

@@ -16,8 +16,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.drive_motion import DriveMotion
-from endopilot.devices.robot import RobotConfig, read_robot
+from endopilot.devices.robot import DriveMotion, RobotConfig, read_robot
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import (

@@ -36,7 +36,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.trajectory import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 FAMILY = Family([each for each in HYPOTHESES if each.name not in (LUMEN, REGISTRATION, DRIFT)])

@@ -14,7 +14,7 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
 from endopilot.simulation.robots import Recorder, Robots, backs_out_mm
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's

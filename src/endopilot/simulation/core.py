@@ -28,8 +28,7 @@ from endopilot.simulation.config import (
     gpu_errors,
     wall_stiffness,
 )
-from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.tubes import TransmissionLayout, TubeLayout
+from endopilot.simulation.rod import RodLayout, TransmissionLayout, TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3  # a node's displacement (mm) in a Newton step at most; larger ones tangle the wire

@@ -23,8 +23,7 @@ from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, CoreMotion, Lumen, Simulation, SimulatorConfig
 from endopilot.simulation.core import make_lumen, make_simulation
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out
-from endopilot.simulation.tubes import lay_out_transmission, lay_out_tubes
+from endopilot.simulation.rod import LONGEST_ELEMENTS, RodLayout, lay_out, lay_out_transmission, lay_out_tubes
 from endopilot.types import Anatomy, Centerline, DistanceMap, VesselTree
 
 FINE_MM = 0.2  # spacing of a finer grid, mm, at most: a tube's axis then reads at most 0.1 mm too near to the wall

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.simulation.groups import Group
-from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.trajectory import SimulationSetUp
 from endopilot.types import TipProjection
 
 

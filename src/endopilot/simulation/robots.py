@@ -10,13 +10,11 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.drive_motion import DriveMotion
-from endopilot.devices.robot import RobotConfig
+from endopilot.devices.robot import DriveMotion, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import Step, Trajectory
 
 
 class Recorder:

@@ -29,8 +29,7 @@ from endopilot.simulation.core_state import run_along
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.readout import Readout
-from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, SimulatorState, Step, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at

@@ -1,4 +1,4 @@
-"""What simulated devices did, sample by sample, and what they were simulated with: `Trajectory`, its files and tables.
+"""What devices are simulated with and what they did, sample by sample: `SimulationSetUp`, `Step` and `Trajectory`.
 
 =======================  ==========================================================================================
 suffix                   content
@@ -30,15 +30,77 @@ from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, regular, writing
 from endopilot.settings import public
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.signals import SIGNALS, SolvedOutputs, described, table_columns
-from endopilot.simulation.state import SimulationSetUp
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure  # slow to import
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationSetUp:
+    """What worlds are simulated with: a `Simulator` made of it and the same commands give the same bits.
+
+    Attributes:
+        anatomies: the vessel of each world; `stacks` its devices.
+        initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
+            on its way already.
+        friction: Coulomb coefficient of each device on the wall.
+        actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
+        motion: how every vessel moves with time; None where they lie still.
+    """
+
+    anatomies: Sequence[Anatomy]
+    stacks: Sequence[Stack]
+    initial: Float[np.ndarray, "worlds devices 2"]
+    friction: Float[np.ndarray, "worlds devices"]
+    actuation: Actuation
+    motion: Motion | None
+    config: SimulatorConfig
+
+    @property
+    def largest(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Largest magnitudes that commands may have: mm/s and rad/s, or N and N·mm, with a hair for rounding."""
+        fastest = np.array([stack.fastest for stack in self.stacks]) * (1 + 1e-6)
+        return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
+
+
+@described
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step(SolvedOutputs):
+    """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, with a row a world."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorState:
+    """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
+    `values` is an array for each pair of anatomy and device, a row a world; `fingerprint` a hash of what it belongs to.
+    """
+
+    values: tuple[Float[np.ndarray, "_ _"], ...]
+    fingerprint: str
+
+    def write(self, path: Path | str) -> None:
+        """Write the state to an .npz file, whole or not at all."""
+        arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
+        with writing(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def read(path: Path | str) -> SimulatorState:
+        """Read a state; InputError if the file is missing or is no saved state."""
+        try:
+            with np.load(regular(path), allow_pickle=False) as stored:
+                count = sum(name.startswith("values_") for name in stored.files)
+                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
+        except (OSError, ValueError, KeyError, BadZipFile) as error:
+            raise InputError(
+                f"{path}: no saved state of a simulator ({error}); write one with SimulatorState.write"
+            ) from None
+
 
 TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
 FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else

@@ -16,8 +16,7 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import Loading, of_device, run_core
-from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.tubes import TubeLayout
+from endopilot.simulation.rod import RodLayout, TubeLayout
 from endopilot.types import Insertion
 
 X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))  # free rods point along x from 0
