@@ -109,8 +109,8 @@ def evaluate(
         )
     chosen = {split: _chosen(data, config.sequences) for split, data in held_out.items()}
     results: dict[str, SplitResult] = {}
-    steps = sum(count_steps(data) for data in chosen.values())
-    with progress("Evaluating", total=steps) as advance:
+    patients = sum(len(np.unique(data.anatomy)) for data in chosen.values())
+    with progress("Evaluating", total=(1 + len(PROTOCOLS)) * patients) as advance:
         for split, data in chosen.items():
             results[split] = run_protocols(predictor, data, training, advance, robot)
     metrics = _metrics(results, known, config.seed) | {
@@ -298,11 +298,6 @@ def baselines(data: Dataset, training: Dataset | None) -> tuple[dict[str, Contro
 
 
 PROTOCOLS = ("forward", "inverse", "dual")  # what a predictor does with the episodes of each patient
-
-
-def count_steps(data: Dataset) -> int:
-    """Return how often `run_protocols` calls its `advance`."""
-    return (1 + len(PROTOCOLS)) * len(np.unique(data.anatomy))
 
 
 def run_protocols(

@@ -22,7 +22,7 @@ from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
-from endopilot.simulation.world import NOMINAL, QUANTITIES, World, drawn_sides, read_world, world_by
+from endopilot.simulation.world import NOMINAL, QUANTITIES, World, differing, drawn_sides, read_world
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
@@ -181,7 +181,7 @@ def world_of(case: str, share: float, navigation: Navigation, task: Task, place:
     elif case != "matched":
         name, side = case.split("-")
         change = {name: share if side == "more" else -share}
-    return world_by(change, navigation.anatomy)
+    return differing(change, navigation.anatomy, World())
 
 
 def _drive_one(path: Path, *, policy: str, terms: Terms, share: float) -> None:

@@ -192,7 +192,9 @@ def make_groups(
             config=config,
             tubes=lay_out_tubes(stack, length_mm=longest_mm + FREE_BEHIND_MM),
             motion=moving,
-            transmission=lay_out_transmission(stack, longest_mm=longest_mm + FREE_BEHIND_MM),
+            transmission=lay_out_transmission(
+                stack, longest_mm=longest_mm + FREE_BEHIND_MM, processor=config.processor
+            ),
         )
         groups.append(Group(anatomy, stack, rod, vessel, moving, simulation, np.array(worlds), path_mm, longest_mm))
     return groups

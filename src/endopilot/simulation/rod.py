@@ -203,37 +203,30 @@ def lay_out_tubes(stack: Stack, *, length_mm: float) -> TubeLayout | None:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class TransmissionLayout:
-    """Devices behind the ostium, the innermost first: length between drive and ostium (0: the drive acts there),
-    friction torque a length, and GJ of equal stretches from the tip, as in `TubeLayout`."""
-
-    spacing_mm: float
-    length_mm: Float[np.ndarray, "devices"]
-    friction_n_mm_mm: Float[np.ndarray, "devices"]
-    twist_n_mm2: Float[np.ndarray, "devices stretches"]
-
-    def model(self, processor: Processor = "cpu") -> CoreTransmission:
-        """Return the devices as the core wants them."""
-        twists = np.cumsum(self.spacing_mm / self.twist_n_mm2, axis=1)
-        return core_for(processor).make_transmission(
-            spacing=self.spacing_mm,
-            length=np.asarray(self.length_mm, dtype=float),
-            friction=np.asarray(self.friction_n_mm_mm, dtype=float),
-            compliance=np.concatenate([np.zeros((len(twists), 1)), twists], axis=1),
-        )
+def make_transmission(
+    length_mm: Float[np.ndarray, "devices"],
+    friction_n_mm_mm: Float[np.ndarray, "devices"],
+    twist_n_mm2: Float[np.ndarray, "devices stretches"],
+    processor: Processor = "cpu",
+) -> CoreTransmission:
+    """Return devices behind the ostium as the core wants them, the innermost first: length between drive and ostium (0:
+    the drive acts there), friction torque a length, and GJ of stretches of 1 mm from the tip."""
+    twists = np.cumsum(_BEHIND_SPACING_MM / twist_n_mm2, axis=1)
+    return core_for(processor).make_transmission(
+        spacing=_BEHIND_SPACING_MM,
+        length=length_mm,
+        friction=friction_n_mm_mm,
+        compliance=np.concatenate([np.zeros((len(twists), 1)), twists], axis=1),
+    )
 
 
-def lay_out_transmission(stack: Stack, *, longest_mm: float) -> TransmissionLayout | None:
+def lay_out_transmission(stack: Stack, *, longest_mm: float, processor: Processor) -> CoreTransmission | None:
     """Return how a stack's drives, of which `longest_mm` may lie ahead of the catheter, act; None if at the ostium."""
     each = stack.transmissions
     if not any(one.length_mm > 0 for one in each):
         return None
     stretches = int(np.ceil((longest_mm + max(one.length_mm for one in each)) / _BEHIND_SPACING_MM)) + 1
     middle = _BEHIND_SPACING_MM * (np.arange(stretches) + 0.5)
-    return TransmissionLayout(
-        spacing_mm=_BEHIND_SPACING_MM,
-        length_mm=np.array([one.length_mm for one in each]),
-        friction_n_mm_mm=np.array([one.twist_friction_n_mm_mm for one in each]),
-        twist_n_mm2=np.array([device.twist_stiffness(middle) for device in stack.devices]),
-    )
+    length, friction = np.array([[one.length_mm, one.twist_friction_n_mm_mm] for one in each]).T.copy()
+    twist = np.array([device.twist_stiffness(middle) for device in stack.devices])
+    return make_transmission(length, friction, twist, processor)

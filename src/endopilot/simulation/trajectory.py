@@ -13,7 +13,8 @@ suffix                   content
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +75,16 @@ class Step(SolvedOutputs):
     """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, with a row a world."""
 
 
+@contextmanager
+def _stored(path: Path | str, what: str, mend: str) -> Iterator[Any]:
+    """Open an .npz file; InputError if it is missing, or `what` the block takes out of it is not there."""
+    try:
+        with np.load(regular(path), allow_pickle=False) as stored:
+            yield stored
+    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
+        raise InputError(f"{path}: no {what} ({error}); {mend}") from None
+
+
 @dataclass(frozen=True, eq=False)
 class SimulatorState:
     """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
@@ -92,14 +103,9 @@ class SimulatorState:
     @staticmethod
     def read(path: Path | str) -> SimulatorState:
         """Read a state; InputError if the file is missing or is no saved state."""
-        try:
-            with np.load(regular(path), allow_pickle=False) as stored:
-                count = sum(name.startswith("values_") for name in stored.files)
-                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
-            raise InputError(
-                f"{path}: no saved state of a simulator ({error}); write one with SimulatorState.write"
-            ) from None
+        with _stored(path, "saved state of a simulator", "write one with SimulatorState.write") as stored:
+            count = sum(name.startswith("values_") for name in stored.files)
+            return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
 
 
 TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
@@ -251,7 +257,7 @@ class Trajectory(SolvedOutputs):
             for each in fields(self)
             if each.name not in ("start", "reason") and isinstance(value := getattr(self, each.name), np.ndarray)
         }
-        tip = TipProjection(**{name: take(getattr(self.tip, name)) for name in TipProjection.__dataclass_fields__})
+        tip = TipProjection(**{name: take(each) for name, each in vars(self.tip).items()})
         return replace(self, tip=tip, columns={name: take(each) for name, each in self.columns.items()}, **chosen)
 
 
@@ -262,7 +268,7 @@ def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:
         for each in fields(trajectory)
         if isinstance(value := getattr(trajectory, each.name), np.ndarray)
     }
-    arrays |= {f"tip_{name}": getattr(trajectory.tip, name) for name in TipProjection.__dataclass_fields__}
+    arrays |= {f"tip_{name}": each for name, each in vars(trajectory.tip).items()}
     set_up = trajectory.set_up
     arrays |= {"initial": set_up.initial, "friction": set_up.friction, "control": trajectory.control}
     return arrays | trajectory.columns
@@ -292,14 +298,11 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file; without its anatomy (of all worlds, or one for each) it is not replayed or
     plotted. Raises InputError for another file, version or vessel."""
-    try:
-        with np.load(regular(path), allow_pickle=False) as stored:
-            about = json.loads(str(stored["about"]))
-            arrays = {name: stored[name] for name in stored.files if name != "about"}
+    with _stored(path, "trajectory", "give a file that Trajectory.write made") as stored:
+        about = json.loads(str(stored["about"]))
+        arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
-        raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
     missing = {each.name for each in fields(SolvedOutputs)} - arrays.keys()
