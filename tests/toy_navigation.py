@@ -138,9 +138,10 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, advance, **_):
+    def simulate_navigations(set_up, control, *, advance, **_):
         control = control.astype(np.float32).astype(float)
-        trajectory = simulate(anatomy, stacks[0], control, initial=initial, config=config, friction=friction)
+        given = {name: getattr(set_up, name) for name in ("initial", "config", "friction")}
+        trajectory = simulate(set_up.anatomies[0], set_up.stacks[0], control, **given)
         advance(control.shape[0] * control.shape[1])
         return trajectory, np.zeros(len(control), dtype=bool)
 

@@ -35,7 +35,7 @@ from endopilot.parallel import CORES
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
 from endopilot.simulation.robots import in_grip
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
@@ -227,18 +227,20 @@ def write_block(
     world = layout.world.leaning(config.seed)
     stacks = draw.stacks(stack)
     true = {id(each): world.stack(each) for each in stacks}
-    friction = world.stack(stack).frictions(draw.friction * world.friction_factor)
+    set_up = SimulationSetUp(
+        anatomies=[world.anatomy(anatomy)] * len(stacks),
+        stacks=[true[id(each)] for each in stacks],
+        initial=draw.initial,
+        friction=world.stack(stack).frictions(draw.friction * world.friction_factor),
+        actuation=config.control,
+        motion=block.patient.motion,
+        config=replace(world.core(config.simulator), threads=threads),
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
         trajectory, stopped = simulate_navigations(
-            world.anatomy(anatomy),
-            [true[id(each)] for each in stacks],
-            draw.initial,
+            set_up,
             draw.control,
-            friction,
-            replace(world.core(config.simulator), threads=threads),
-            actuation=config.control,
-            motion=block.patient.motion,
             robot=layout.robot,
             ostium_mm=world.ostium_mm,
             seeds=draw.seeds,

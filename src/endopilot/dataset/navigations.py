@@ -22,12 +22,11 @@ from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_shape_memory
-from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
 TIP_GROUP = 8  # navigations, from the first on, that share a drawn tip: a simulation has one rod
@@ -133,27 +132,22 @@ _ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled
 
 
 def simulate_navigations(
-    anatomy: Anatomy,
-    stacks: Sequence[Stack],
-    initial: Float[np.ndarray, "worlds devices 2"],
+    set_up: SimulationSetUp,
     control: Float[np.ndarray, "worlds samples devices 2"],
-    friction: Float[np.ndarray, "worlds devices"],
-    config: SimulatorConfig,
     *,
-    actuation: Actuation = "velocity",
-    motion: Motion | None = None,
     robot: RobotConfig | None = None,
     seeds: Sequence[Sequence[int]] = (),
     ostium_mm: float = 0.0,
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
-    """Simulate drawn navigations, and return them and which were stopped short of the vessel's ends. A robot's columns
-    are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the mean of what its
-    drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
+    """Simulate drawn navigations of one anatomy, and return them and which were stopped short of the vessel's ends. A
+    robot's columns are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the
+    mean of what its drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
+    anatomy, stacks, actuation = set_up.anatomies[0], set_up.stacks, set_up.actuation
     watch = _PushRoom(anatomy.tree, stacks)
-    simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
-    _begin(simulator, watch, initial, friction)
+    simulator = Simulator(anatomy, stacks, actuation=actuation, motion=set_up.motion, config=set_up.config)
+    _begin(simulator, watch, set_up.initial, set_up.friction)
     if record_shape:
         check_shape_memory(len(control), control.shape[1], simulator.nodes)
     recorder = Recorder(simulator, SAMPLE_PERIOD_S, record_shape=record_shape)
