@@ -65,7 +65,7 @@ class SidePlan:
 
 
 def until_it_fits(what: str, draw: Callable[..., Drawn], *given: Any) -> Drawn:
-    """Draw trees from what is given until one fits, whose record states how many failed (`redrawn`); NoShape after 60 draws."""
+    """Draw trees from what is given until one fits; its record states how many failed (`redrawn`), NoShape after 60."""
     for attempt in range(60):
         try:
             tree, drawn = draw(*given)
