@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, uniform_filter
 
 from benchmarks.figures import Bar
-from endopilot.angiograms.beam import CLASSES
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.phantom.chest import place

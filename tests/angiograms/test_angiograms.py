@@ -16,7 +16,7 @@ import SimpleITK as sitk
 
 from endopilot import make_angiograms
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.angiograms.beam import CLASSES
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.cli import main
 from endopilot.devices.stack import Stack

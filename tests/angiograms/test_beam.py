@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.anatomy.analytic_lumens import forked_tree
-from endopilot.angiograms.beam import Beam, harmonised, shown
+from endopilot.angiograms.cine import Beam, harmonised, shown
 from endopilot.angiograms.flow import Flow, Injection, grow
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM, without_contrast

@@ -16,7 +16,7 @@ from bend import vessel
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.readout import Readout
+from endopilot.simulation.groups import Readout
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import SimulatorState

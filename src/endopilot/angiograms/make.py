@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.angiograms.beam import CLASSES
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS

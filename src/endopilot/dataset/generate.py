@@ -25,7 +25,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import SPLITS, Block, Layout, make_layout, version
-from endopilot.dataset.navigations import Draw, draw_navigations, simulate_navigations
+from endopilot.dataset.navigations import Draw, draw_navigations, simulate_navigations, stacks_with_tips
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack, column_prefixes
@@ -225,11 +225,10 @@ def write_block(
     config, anatomy, stack = layout.config, _read(block.patient.folder, block.patient.identity), layout.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
     world = layout.world.leaning(config.seed)
-    stacks = draw.stacks(stack)
-    true = {id(each): world.stack(each) for each in stacks}
+    stacks = stacks_with_tips(stack, world, draw.tip_bend_rad, draw.tip_stiffness_factor)
     set_up = SimulationSetUp(
         anatomies=[world.anatomy(anatomy)] * len(stacks),
-        stacks=[true[id(each)] for each in stacks],
+        stacks=stacks,
         initial=draw.initial,
         friction=world.stack(stack).frictions(draw.friction * world.friction_factor),
         actuation=config.control,

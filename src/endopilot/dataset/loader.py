@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.layout import identify, version
+from endopilot.dataset.navigations import stacks_with_tips
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
@@ -113,13 +114,10 @@ class Dataset(Outputs):
         """Return what episodes of one anatomy (read if not given; InputError if missing or another one) were simulated
         with; their `command` then gives them again to the bit."""
         anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
-        world, given, config = self.world, self.stack, self.manifest["config"]
-        tips = list(zip(self.tip_bend.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
-        drawn = {tip: given.wire.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]) for tip in tips}
-        stacks = {tip: world.stack(replace(given, wire=wire)) for tip, wire in drawn.items()}
+        world, config = self.world, self.manifest["config"]
         return SimulationSetUp(
             anatomies=[world.anatomy(anatomy)] * len(self),
-            stacks=[stacks[tip] for tip in tips],
+            stacks=stacks_with_tips(self.stack, world, self.tip_bend, self.tip_stiffness_factor),
             initial=self.initial,
             friction=self.friction,
             actuation=config["control"],

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,6 +28,7 @@ from endopilot.simulation.motion import Motion, motion_named
 from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.world import World
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
 TIP_GROUP = 8  # navigations, from the first on, that share a drawn tip: a simulation has one rod
@@ -47,15 +49,16 @@ class Draw:
     tip_stiffness_factor: Float[np.ndarray, "n"]
     seeds: tuple[tuple[int, int], ...] = ()
 
-    def stacks(self, given: Stack) -> list[Stack]:
-        """Return each navigation's devices: one object for each tip, `given` itself where nothing is drawn."""
-        made = {(given.wire.tip_bend_rad, 1.0): given}
-        tips = list(zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
-        for bend_rad, factor in tips:
-            if (bend_rad, factor) not in made:
-                wire = given.wire.with_tip(bend_rad=bend_rad, stiffness_factor=factor)
-                made[bend_rad, factor] = replace(given, wire=wire)
-        return [made[tip] for tip in tips]
+
+def stacks_with_tips(
+    given: Stack, world: World, tip_bend_rad: Float[np.ndarray, "n"], tip_stiffness_factor: Float[np.ndarray, "n"]
+) -> list[Stack]:
+    """Return each navigation's devices as they are in a world, with the tip drawn for it: one object for each tip."""
+    tips, made = list(zip(tip_bend_rad.tolist(), tip_stiffness_factor.tolist(), strict=True)), dict[Any, Stack]()
+    for bend_rad, factor in dict.fromkeys(tips):
+        wire = given.wire.with_tip(bend_rad=bend_rad, stiffness_factor=factor)
+        made[bend_rad, factor] = world.stack(replace(given, wire=wire))
+    return [made[tip] for tip in tips]
 
 
 def draw_navigations(
