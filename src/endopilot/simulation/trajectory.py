@@ -33,7 +33,7 @@ from endopilot.files import json_text, regular, writing
 from endopilot.settings import public
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, place
-from endopilot.simulation.signals import SIGNALS, SolvedOutputs, described, table_columns
+from endopilot.simulation.signals import SIGNALS, Step, described, table_columns
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:
@@ -67,12 +67,6 @@ class SimulationSetUp:
         """Largest magnitudes that commands may have: mm/s and rad/s, or N and N·mm, with a hair for rounding."""
         fastest = np.array([stack.fastest for stack in self.stacks]) * (1 + 1e-6)
         return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
-
-
-@described
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Step(SolvedOutputs):
-    """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, with a row a world."""
 
 
 @contextmanager
@@ -116,7 +110,7 @@ _REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went throug
 
 @described
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trajectory(SolvedOutputs):
+class Trajectory(Step):
     """The recorded motion of the devices of simulated worlds, one sample every `period_s`.
 
     Sample t is the state at the end of period t, and `command[:, t]` held over that period. Device 0 is the wire; the
@@ -305,7 +299,7 @@ def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | 
             raise KeyError("format")
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
-    missing = {each.name for each in fields(SolvedOutputs)} - arrays.keys()
+    missing = {each.name for each in fields(Step)} - arrays.keys()
     if missing:
         raise InputError(f"{path}: lacks {', '.join(sorted(missing))}, which this version records; simulate it again")
     vessels = _vessels(path, about, anatomy)
