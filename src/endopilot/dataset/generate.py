@@ -214,7 +214,9 @@ def write_episode(
         tip_bend_rad=np.array([stack.wire.tip_bend_rad]),
         tip_stiffness_factor=np.array([tip_stiffness_factor]),
     )
-    store_block(layout, block, drawn, trajectory, np.array([False]))
+    episodes = _episodes(layout, block, drawn, trajectory, np.array([False]))
+    samples = parquet.sample_columns(trajectory, block.first_episode)
+    parquet.write_tables(output, block.number, layout.key, episodes=episodes, samples=samples)
     describe(layout, [block], {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0})
 
 
@@ -245,21 +247,9 @@ def write_block(
             seeds=draw.seeds,
             advance=advance,
         )
-    store_block(layout, block, draw, trajectory, stopped)
-
-
-def store_block(
-    layout: Layout, block: Block, draw: Draw, trajectory: Trajectory, stopped: Bool[np.ndarray, "n"]
-) -> None:
-    """Write a block's navigations, one world each: their episodes, then their samples, which mark both as complete."""
-    data_path, episodes_path = schema.paths_of_file(layout.output, block.number)
-    samples = parquet.sample_table(trajectory, block.first_episode, layout.key)
-    for path, table in (
-        (episodes_path, parquet.marked_table(_episodes(layout, block, draw, trajectory, stopped), layout.key)),
-        (data_path, samples),
-    ):
-        with writing(path) as partial:
-            partial.write_bytes(parquet.parquet_bytes(table))
+    episodes = _episodes(layout, block, draw, trajectory, stopped)
+    samples = parquet.sample_columns(trajectory, block.first_episode)
+    parquet.write_tables(layout.output, block.number, layout.key, episodes=episodes, samples=samples)
 
 
 @lru_cache(maxsize=4)
