@@ -41,7 +41,10 @@ _MEND = "make the dataset again"
 class Dataset(Outputs):
     """Episodes of equal length. Sample t is the state at the end of period t; `control[:, t]` is the mean over it.
 
-    Device 0 is the wire; the catheters around it follow from the inside out.
+    Device 0 is the wire; the catheters around it follow from the inside out. `command`, simulated again, gives the same
+    navigation to the bit, which `control` does not: a drive that pushes at one speed until it slips strains the wire
+    otherwise than one that is slower from the start. Where no robot made the motions, `decided`, `encoders` and `load`
+    are None; else `command` is what its drives made of what was decided, as the mean over a sample.
 
     Attributes:
         folder: where it was read from.
@@ -51,20 +54,8 @@ class Dataset(Outputs):
         sequence: index of each episode among those of its anatomy.
         split: "train", "seen_test", "calibrate" or "test".
         device: name of the wire.
-        friction: Coulomb coefficient of each device on the wall.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
-        initial: Δ (mm) and φ (rad) of each device before the first period.
-        command: what the drives were commanded: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
-            Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at
-            one speed until it slips strains the wire otherwise than one that is slower from the start.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
-        tip_abscissa: Δtip, mm.
-        tip_offset: γtip, mm.
-        decided: what the robot was commanded, mm/s and rad/s; None where no robot made the motions, and `command` is
-            what its drives made of that, as the mean over a sample.
-        encoders: inserted length, mm, and rotation, rad, as the robot measured them, likewise.
-        load: force, N, and torque, N·mm, of the drives as the robot measured them, likewise.
         branch: index of the branch that the tip lies in.
         lumen_radius: lumen radius at the tip's projection, mm.
     """

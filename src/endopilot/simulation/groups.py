@@ -41,17 +41,12 @@ def make_wall(anatomy: Anatomy, stack: Stack, config: SimulatorConfig) -> Lumen:
     radius_mm = stack.outer_radius_mm
     varies = config.wall_along or config.wall_around
     field = _stiffened(anatomy, radius_mm, config) if varies else anatomy.distance_map
-    wall = make_lumen(field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
+    lumen = partial(make_lumen, field, radius_mm, config.processor, far_mm=config.wall_reach_mm)
+    wall = lumen()
     if not stack.catheters or _leaves_room(wall, anatomy, radius_mm):
         return wall
-    return make_lumen(
-        field,
-        radius_mm,
-        config.processor,
-        far_mm=config.wall_reach_mm,
-        finer=max(2, math.ceil(field.spacing_mm / FINE_MM)),
-        spheres=_inscribed_spheres(wall, anatomy),
-    )
+    finer = max(2, math.ceil(field.spacing_mm / FINE_MM))
+    return lumen(finer=finer, spheres=_inscribed_spheres(wall, anatomy))
 
 
 def factor_at(
