@@ -355,7 +355,7 @@ def _predicted(
             patients = "patient" if len(errors) == 1 else "patients"
             advance(1, f"{protocol}; P1: Δtip errs by {np.nanmean(errors):.3f} mm in {len(errors)} {patients}")
         back = np.argsort(order)
-        signals = ([getattr(rollout, name) for rollout in rollouts] for name in ("tip", "proximal", "control"))
+        signals = ([getattr(rollout, name) for rollout in rollouts] for name in ("tip", "control"))
         found[protocol] = OpenLoop(*(np.concatenate(signal)[back] for signal in signals))
     return found
 
