@@ -53,7 +53,6 @@ class Dataset(Outputs):
         anatomy: name of each episode's anatomy.
         sequence: index of each episode among those of its anatomy.
         split: "train", "seen_test", "calibrate" or "test".
-        device: name of the wire.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
         branch: index of the branch that the tip lies in.
@@ -66,7 +65,6 @@ class Dataset(Outputs):
     anatomy: Shaped[np.ndarray, "episodes"]
     sequence: Int[np.ndarray, "episodes"]
     split: Shaped[np.ndarray, "episodes"]
-    device: Shaped[np.ndarray, "episodes"]
     friction: Float[np.ndarray, "episodes devices"]
     tip_bend: Float[np.ndarray, "episodes"]
     tip_stiffness_factor: Float[np.ndarray, "episodes"]
@@ -262,7 +260,6 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         anatomy=episode["anatomy"].astype(str),
         sequence=episode["sequence"],
         split=episode["split"].astype(str),
-        device=episode["device"].astype(str),
         friction=np.stack([episode[f"{prefix}friction"] for prefix in prefixes], axis=-1),
         tip_bend=episode["tip_bend_rad"],
         tip_stiffness_factor=episode["tip_stiffness_factor"],
