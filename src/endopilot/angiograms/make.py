@@ -8,7 +8,6 @@ whole folders, and ends with the same bits as one that was not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -132,11 +131,6 @@ def _make(
         return
     from endopilot.dataset.generate import run_on_cluster  # brings the libraries of data sets
 
-    remote = replace(
-        layout,
-        output=layout.output.resolve(),
-        sources=tuple(source.resolve() for source in layout.sources),
-    )
-    missing = [path.resolve() for path in paths if not path.exists()]
+    missing = [path for path in paths if not path.exists()]
     with progress(title, len(missing)) as advance:
-        run_on_cluster(partial(work, remote), missing, lambda path, _: advance(remark=path.name), where)
+        run_on_cluster(partial(work, layout), missing, lambda path, _: advance(remark=path.name), where)

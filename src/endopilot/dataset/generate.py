@@ -105,10 +105,7 @@ def generate_dataset(
         if scheduler is None:
             run_locally(layout, missing, done, report)
         else:
-            remote = replace(layout, output=layout.output.resolve())
-            there = (block.patient._replace(folder=block.patient.folder.resolve()) for block in missing)
-            items = [replace(block, patient=patient) for block, patient in zip(missing, there, strict=True)]
-            run_on_cluster(partial(write_timed, remote), items, done, scheduler)
+            run_on_cluster(partial(write_timed, layout), missing, done, scheduler)
         work["wall_seconds"] = time.perf_counter() - start
     describe(layout, blocks, work)
 
@@ -148,7 +145,7 @@ def describe(layout: Layout, blocks: Sequence[Block], work: dict[str, Any]) -> N
     anatomies = [
         {
             "name": patient.name,
-            "folder": os.path.relpath(patient.folder.resolve(), output.resolve()),
+            "folder": os.path.relpath(patient.folder, output),
             "sha256": patient.identity,
             "motion": None if patient.motion is None else asdict(patient.motion),
         }
