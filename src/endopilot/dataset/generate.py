@@ -105,7 +105,7 @@ def generate_dataset(
         if scheduler is None:
             run_locally(layout, missing, done, report)
         else:
-            run_on_cluster(partial(write_timed, layout), missing, done, scheduler)
+            run_on_cluster(partial(write_block, layout), missing, done, scheduler)
         work["wall_seconds"] = time.perf_counter() - start
     describe(layout, blocks, work)
 
@@ -219,8 +219,10 @@ def write_episode(
 
 def write_block(
     layout: Layout, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
-) -> None:
-    """Simulate one block and write it; `advance` is called with the numbers of samples simulated."""
+) -> float:
+    """Simulate one block and write it; return the processor time that this process took for it, s. `advance` is called
+    with the numbers of samples simulated."""
+    started = time.process_time()
     config, anatomy, stack = layout.config, _read(block.patient.folder, block.patient.identity), layout.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
     world = layout.world.leaning(config.seed)
@@ -247,6 +249,7 @@ def write_block(
     episodes = _episodes(layout, block, draw, trajectory, stopped)
     samples = parquet.sample_columns(trajectory, block.first_episode)
     parquet.write_tables(layout.output, block.number, layout.key, episodes=episodes, samples=samples)
+    return time.process_time() - started
 
 
 @lru_cache(maxsize=4)
@@ -374,10 +377,3 @@ def _check_versions(client, scheduler: str) -> None:
     for worker, other in found.items():
         if other != version():
             raise InputError(f"scheduler: worker {worker} has {other}, here is {version()}; install the same")
-
-
-def write_timed(layout: Layout, block: Block) -> float:
-    """Write a block and return the processor time that it took, s."""
-    started = time.process_time()
-    write_block(layout, block)
-    return time.process_time() - started
