@@ -129,10 +129,6 @@ class RobotConfig:
         braking = self.of_drives(len(velocity), "max_acceleration_mm_s2", "max_acceleration_rad_s2")
         return velocity * self.latency_s + velocity * np.abs(velocity) / (2 * braking)
 
-    def delayed(self, factor: float) -> RobotConfig:
-        """Return a robot whose latency is some times this one's."""
-        return replace(self, latency_s=self.latency_s * factor)
-
     def write(self, path: Path | str) -> None:
         """Write the robot as a YAML file for `read_robot`, whole or not at all; InputError if it cannot be written."""
         write_yaml(Path(path), asdict(self))

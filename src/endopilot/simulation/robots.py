@@ -28,10 +28,6 @@ class Recorder:
         self._steps: list[Step] = []
         self._shapes: list[np.ndarray] | None = [] if record_shape else None
 
-    def __len__(self) -> int:
-        """Return the number of steps so far."""
-        return len(self._steps)
-
     def step(self, control: ArrayLike) -> Step:
         """Drive every world for a period, as `Simulator.step` does."""
         self._steps.append(self.simulator.step(control, self.period_s))

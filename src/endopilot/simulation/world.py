@@ -219,7 +219,8 @@ class World:
 
     def real_robot(self, given: RobotConfig) -> RobotConfig:
         """Return the robot as it truly is."""
-        return (self.robot or given).delayed(self.latency_factor)
+        robot = self.robot or given
+        return replace(robot, latency_s=robot.latency_s * self.latency_factor)
 
     def write(self, path: Path | str) -> None:
         """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if that fails."""
