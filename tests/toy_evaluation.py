@@ -9,8 +9,7 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.evaluation.results import SplitResult, TipSeries
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import (
     Anatomy,
     Branch,

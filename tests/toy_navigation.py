@@ -22,8 +22,7 @@ from endopilot.dataset.loader import read_dataset
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import (
     SAMPLE_PERIOD_S,
     Anatomy,
@@ -139,9 +138,10 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, advance, **_):
+    def simulate_navigations(set_up, control, *, advance, **_):
         control = control.astype(np.float32).astype(float)
-        trajectory = simulate(anatomy, stacks[0], control, initial=initial, config=config, friction=friction)
+        given = {name: getattr(set_up, name) for name in ("initial", "config", "friction")}
+        trajectory = simulate(set_up.anatomies[0], set_up.stacks[0], control, **given)
         advance(control.shape[0] * control.shape[1])
         return trajectory, np.zeros(len(control), dtype=bool)
 
@@ -161,7 +161,7 @@ def make_toy_dataset(
     """Generate a dataset with the toy wire in place of the rod; two thirds of the patients train, the others test."""
     shares = (2 / 3, 0.0, 1 / 3) if patients > 1 else None
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
-    with patch("endopilot.dataset.workers.simulate_navigations", toy_navigate(simulate)):
+    with patch("endopilot.dataset.generate.simulate_navigations", toy_navigate(simulate)):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
         generate_dataset(anatomies, output=folder, device=read_wire(device), config=config, scheduler=scheduler)
 

@@ -14,7 +14,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
-from endopilot.ladder.mismatch import CASES, world_of
+from endopilot.ladder.ladder import CASES, world_of
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Observation
 from endopilot.settings import Count
@@ -56,7 +56,7 @@ def compare_replanning(
 
     Args:
         tasks: of the ladder.
-        case: of model mismatch, one of `endopilot.ladder.mismatch.CASES`.
+        case: of model mismatch, one of `endopilot.ladder.ladder.CASES`.
         patients: of each task.
     """
     found: dict[tuple[str, str], list[list[float]]] = {}

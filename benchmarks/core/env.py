@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from benchmarks.core.reference import CONVERGED
 from benchmarks.figures import spread
-from endopilot.env.episodes import CONTROL_PERIOD_S
+from endopilot.env.observation import CONTROL_PERIOD_S
 from endopilot.env.vector import ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
 from endopilot.files import processor_name
 from endopilot.simulation.config import SimulatorConfig

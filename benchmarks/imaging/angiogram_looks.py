@@ -17,8 +17,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, uniform_filter
 
 from benchmarks.figures import Bar
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.angiograms.masks import CLASSES
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.phantom.chest import place
 from endopilot.phantom.phantom import make_phantom

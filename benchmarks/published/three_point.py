@@ -7,7 +7,7 @@ import numpy as np
 from endopilot.devices.device import Wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
-from endopilot.verification.case import Loading, driven, straight_rod
+from endopilot.verification.free_rod import Loading, driven, straight_rod
 
 SPAN_MM = 40.0
 """Distance of the supports in the published tests, mm."""

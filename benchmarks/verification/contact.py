@@ -11,7 +11,7 @@ from benchmarks.verification.scenes import tortuous_axis, tube
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.types import DistanceMap, Insertion
-from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
+from endopilot.verification.free_rod import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
 
 LEAD_MM = 30.0
 BEND_RADIUS_MM = 15.0

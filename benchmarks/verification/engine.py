@@ -17,7 +17,7 @@ from benchmarks.verification.contact import bent_tube
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.types import Insertion
-from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
+from endopilot.verification.free_rod import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
 
 BAR = 0.02
 MISSING = "MuJoCo is not installed; pip install mujoco-core"

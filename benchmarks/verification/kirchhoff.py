@@ -30,7 +30,7 @@ from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall
 from endopilot.simulation.world import read_world
 from endopilot.tasks.task import CORE
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap
-from endopilot.verification.case import Case, Curve, Picture, compare
+from endopilot.verification.free_rod import Case, Curve, Picture, compare
 
 BEND_N_MM2, BEND_RADIUS_MM = 10.0, 15.0
 OUTSIDE_MM = 0.2

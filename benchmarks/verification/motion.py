@@ -16,8 +16,7 @@ from endopilot.simulation.core import core_options, insertion_arguments, make_lu
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import Insertion
-from endopilot.verification.case import Case, Curve, Picture, compare
-from endopilot.verification.free_rod import rod_energy
+from endopilot.verification.free_rod import Case, Curve, Picture, compare, rod_energy
 
 PERIOD_S = 1.0
 """Period of the tube's motion, s."""

@@ -12,8 +12,16 @@ from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy
-from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
-from endopilot.verification.free_rod import elastica_tip
+from endopilot.verification.free_rod import (
+    Case,
+    Curve,
+    Loading,
+    Picture,
+    compare,
+    elastica_tip,
+    equilibrium,
+    straight_rod,
+)
 
 ORDER_BAR = 0.05
 """Largest relative error of a measured order: 1.9 to 2.1, or 0.95 to 1.05, where the exact answer is known."""

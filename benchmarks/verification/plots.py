@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from endopilot.verification.case import Case, Picture
+from endopilot.verification.free_rod import Case, Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
-from endopilot.verification.case import Loading, driven, uniform_rod
+from endopilot.verification.free_rod import Loading, driven, uniform_rod
 
 _FINE_MM = 0.02
 """Spacing of the points that a vessel's axis is sampled at, mm: the distance to them errs by less than 1e-4 mm."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from endopilot.verification.case import (
+from endopilot.verification.free_rod import (
     Case,
     Curve,
     Loading,

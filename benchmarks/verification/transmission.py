@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.simulation.core import run_core
-from endopilot.simulation.tubes import TransmissionLayout
-from endopilot.verification.case import STATIC, X_AXIS, Case, Curve, Loading, Picture, compare, straight_rod
+from endopilot.simulation.rod import make_transmission
+from endopilot.verification.free_rod import STATIC, X_AXIS, Case, Curve, Loading, Picture, compare, straight_rod
 
 LENGTH_MM, TWIST_N_MM2, FRICTION_N_MM_MM = 1000.0, 80.0, 2e-4
 """L, GJ and m."""
@@ -59,8 +59,7 @@ def turn(
         lanes=1,
         approach=False,
         free_behind_mm=0.0,
-        transmission=TransmissionLayout(
-            spacing_mm=1.0,
+        transmission=make_transmission(
             length_mm=np.array([LENGTH_MM]),
             friction_n_mm_mm=np.array([FRICTION_N_MM_MM]),
             twist_n_mm2=np.full((1, 2), TWIST_N_MM2),

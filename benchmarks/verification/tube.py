@@ -16,7 +16,7 @@ from endopilot.simulation.config import COMPLIANT_WALL_STIFFENING_MM2, Simulator
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import DistanceMap, Insertion
-from endopilot.verification.case import (
+from endopilot.verification.free_rod import (
     STATIC,
     Case,
     Curve,

@@ -11,9 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.tubes import TubeLayout
-from endopilot.verification.case import (
+from endopilot.simulation.rod import RodLayout, TubeLayout
+from endopilot.verification.free_rod import (
     STATIC,
     Case,
     Curve,

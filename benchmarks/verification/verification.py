@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from benchmarks.verification.plots import draw
 from endopilot.verification import free_rod
-from endopilot.verification.case import run
+from endopilot.verification.free_rod import run
 
 
 def bench_verification(*, plots: Path | None = None) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ sys.path.append(str(DOCS.parent))  # where `benchmarks` is
 
 from benchmarks.figures import fill
 from endopilot.control.agent import AgentPolicy
-from endopilot.env.picture import Picture
+from endopilot.env.exposures import Picture
 from endopilot.ladder.attempt import navigation_seed
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import NavigationLoop

@@ -22,7 +22,7 @@ from endopilot.belief.advise import follows
 from endopilot.belief.bands import Calibration
 from endopilot.belief.monitoring import AdviseConfig, Followed, calibrate, coverage, follow_all, measure
 from endopilot.dataset.loader import Dataset, read_dataset
-from endopilot.evaluation.protocols import hold_slack
+from endopilot.evaluation.evaluate import hold_slack
 from endopilot.files import read_json, write_json
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import WINDOW

@@ -38,7 +38,7 @@ from .devices.robot import RobotConfig as RobotConfig
 from .devices.robot import read_robot as read_robot
 from .devices.stack import Stack as Stack
 from .devices.stack import Transmission as Transmission
-from .env.episodes import NavigationState as NavigationState
+from .env.observation import NavigationState as NavigationState
 from .env.single import NavigateEnv as NavigateEnv
 from .env.vector import NavigateVectorEnv as NavigateVectorEnv
 from .errors import InputError as InputError
@@ -85,11 +85,11 @@ from .simulation.controls import ControlConfig as ControlConfig
 from .simulation.motion import Motion as Motion
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
-from .simulation.state import SimulationSetUp as SimulationSetUp
-from .simulation.state import SimulatorState as SimulatorState
-from .simulation.state import Step as Step
 from .simulation.tip_load import TipLoadTest as TipLoadTest
 from .simulation.tip_load import simulate_tip_load as simulate_tip_load
+from .simulation.trajectory import SimulationSetUp as SimulationSetUp
+from .simulation.trajectory import SimulatorState as SimulatorState
+from .simulation.trajectory import Step as Step
 from .simulation.trajectory import Trajectory as Trajectory
 from .simulation.trajectory import read_trajectory as read_trajectory
 from .simulation.world import Stenosis as Stenosis

@@ -16,8 +16,8 @@ import SimpleITK as sitk
 
 from endopilot import make_angiograms
 from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.angiograms.masks import CLASSES
 from endopilot.cli import main
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
@@ -195,7 +195,7 @@ def test_a_cluster_gives_the_same_bits(made, patient, tmp_path, monkeypatch):
         for item in reversed(items):
             done(item, work(item))
 
-    monkeypatch.setattr("endopilot.dataset.workers.run_on_cluster", run)
+    monkeypatch.setattr("endopilot.dataset.generate.run_on_cluster", run)
     make_angiograms([patient], output=tmp_path / "there", device=STACK, config=CONFIG, scheduler="tcp://here:1")
     assert hashes(tmp_path / "there") == hashes(made)
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.anatomy.analytic_lumens import forked_tree
-from endopilot.angiograms.beam import Beam, harmonised, shown
-from endopilot.angiograms.flow import Flow, Injection
-from endopilot.angiograms.twigs import grow
+from endopilot.angiograms.cine import Beam, harmonised, shown
+from endopilot.angiograms.flow import Flow, Injection, grow
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM, without_contrast
 from endopilot.xray.carm import CArmGeometry, view_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.angiograms.masks import box_of, encoded, laid_together, stroke
+from endopilot.angiograms.cine import box_of, encoded, laid_together, stroke
 
 
 def test_a_stroke_covers_the_pixels_within_its_half_width():

@@ -49,7 +49,7 @@ class HoldSlack:
         slack = (length - episodes.tip[..., 0])[:, WINDOW - 1 : WINDOW]
         offset = np.broadcast_to(episodes.tip[:, WINDOW - 1 : WINDOW, 1], length[:, WINDOW:].shape)
         tip = np.stack([length[:, WINDOW:] - slack, offset.astype(float)], axis=-1)
-        return OpenLoop(tip=tip, proximal=tip, control=tip)
+        return OpenLoop(tip=tip, control=tip)
 
     rollout_inverse = rollout_dual = rollout_forward
 

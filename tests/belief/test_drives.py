@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.belief.drives import Drives, Motion
-from endopilot.devices.drive_motion import through_play
-from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.devices.robot import DriveConfig, RobotConfig, through_play
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 START, FASTEST = np.array([[2.0, 0.5]]), np.array([[40.0, 12.6]])

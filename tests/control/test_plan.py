@@ -99,7 +99,7 @@ class Toy:
         before = np.concatenate([episodes.proximal[:, WINDOW - 1 : WINDOW, 0], wanted[:, :-1]], axis=1)
         control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)
         tip = np.stack([SLACK * wanted, np.full_like(wanted, 0.5)], axis=-1)
-        return OpenLoop(tip=tip, proximal=np.zeros_like(tip), control=control)
+        return OpenLoop(tip=tip, control=control)
 
 
 def test_the_inverse_network_of_the_wire_is_asked_for_the_desired_tips(found, vessel, tmp_path, monkeypatch):

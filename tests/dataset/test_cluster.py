@@ -25,7 +25,7 @@ def test_a_cluster_gives_the_same_bits(tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="pip install 'endopilot[cluster]'")
-    monkeypatch.setattr("endopilot.dataset.workers._CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr("endopilot.dataset.generate._CONNECT_TIMEOUT_S", 1)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4, scheduler="tcp://127.0.0.1:9")
 

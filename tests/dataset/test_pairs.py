@@ -28,7 +28,7 @@ from endopilot.simulation.world import World
 WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
 WEAK = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.021)
 CONFIG = DatasetConfig(sequences=3, seconds=10.0, seed=7)
-OF_EPISODES = ("folder", "manifest", "sample_period_s", "anatomy", "sequence", "split", "device", "friction")
+OF_EPISODES = ("folder", "manifest", "sample_period_s", "anatomy", "sequence", "split", "friction")
 OF_EPISODES += ("tip_bend", "tip_stiffness_factor", "initial")
 OF_TRAJECTORY = ("command", "control", *(each.name for each in fields(Outputs)))
 OF_TIP = {"tip_abscissa": "abscissa", "tip_offset": "offset", "branch": "branch", "lumen_radius": "radius"}

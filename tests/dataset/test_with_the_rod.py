@@ -23,7 +23,7 @@ from endopilot.devices.device import read_wire
 from endopilot.devices.robot import DriveConfig, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.evaluation.protocols import Recorded
+from endopilot.evaluation.evaluate import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.simulate import simulate
 
@@ -88,7 +88,8 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     control[..., 1] = np.linspace(-2, 2, 6)[:, None, None]
     initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])[:, None]
     friction = np.linspace(0.05, 0.2, 6)[:, None]
-    driven, stopped = simulate_navigations(anatomy, [Stack(DEVICE)] * 6, initial, control, friction, config)
+    set_up = SimulationSetUp([anatomy] * 6, [Stack(DEVICE)] * 6, initial, friction, "velocity", None, config)
+    driven, stopped = simulate_navigations(set_up, control)
     assert driven.valid.all()
     assert stopped.all()
     assert (driven.tip.abscissa < ends[driven.tip.branch] - 0.5 * STOP_SHORT_MM).all()

@@ -204,4 +204,3 @@ def test_a_grip_weakens_a_device_and_never_strengthens_it() -> None:
     assert DriveConfig().gripped(wire) == wire == DriveConfig(grip_n=9.0, grip_n_mm=9.0).gripped(wire)
     held = DriveConfig(grip_n=0.2, grip_n_mm=0.1).gripped(wire)
     assert (held.push_limit_n, held.pull_limit_n, held.torque_limit_n_mm) == (0.2, 0.2, 0.1)
-    assert np.isclose(RobotConfig(latency_s=0.05).delayed(1.2).latency_s, 0.06)

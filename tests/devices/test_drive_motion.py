@@ -11,8 +11,7 @@ from hypothesis import strategies as some
 
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits, far_end_mm, within_travel
-from endopilot.devices.drive_motion import DriveMotion
-from endopilot.devices.robot import DriveConfig, RobotConfig, read_robot
+from endopilot.devices.robot import DriveConfig, DriveMotion, RobotConfig, read_robot
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Branch, VesselTree

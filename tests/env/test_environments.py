@@ -17,8 +17,14 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
-from endopilot.env.episodes import CONTROL_PERIOD_S, FORCE_REWARD, PROGRESS_REWARD, STEP_REWARD, SUCCESS_REWARD
-from endopilot.env.observation import RouteTables
+from endopilot.env.observation import (
+    CONTROL_PERIOD_S,
+    FORCE_REWARD,
+    PROGRESS_REWARD,
+    STEP_REWARD,
+    SUCCESS_REWARD,
+    RouteTables,
+)
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import NavigateVectorEnv, of_world
 from endopilot.errors import InputError

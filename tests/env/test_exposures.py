@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
-from endopilot.env.episodes import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
+from endopilot.env.observation import CONTROL_PERIOD_S, EXPOSURE_REWARD, STEP_REWARD
 from endopilot.env.single import NavigateEnv
 from endopilot.env.vector import NavigateVectorEnv, of_world
 from endopilot.simulation.motion import motion_named

@@ -15,8 +15,7 @@ from endopilot.cli import main
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
-from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-from endopilot.evaluation.protocols import Recorded
+from endopilot.evaluation.evaluate import EvaluateConfig, Recorded, evaluate
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW

@@ -8,9 +8,8 @@ from dataclasses import replace
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.ladder import mismatch as mismatches
-from endopilot.ladder.ladder import LadderConfig
-from endopilot.ladder.mismatch import CASES, measure_mismatch, world_of
+from endopilot.ladder import ladder
+from endopilot.ladder.ladder import CASES, LadderConfig, measure_mismatch, world_of
 from endopilot.simulation.world import World
 from endopilot.tasks.task import find_task
 
@@ -22,7 +21,7 @@ def measured(tmp_path_factory):
     """Return a folder in which `forward` did the lowest task in one patient in three of the cases, and the rows."""
     folder = tmp_path_factory.mktemp("mismatch") / "forward"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mismatches, "CASES", ("matched", "ostium-more", "all"))
+        patch.setattr(ladder, "CASES", ("matched", "ostium-more", "all"))
         return folder, measure_mismatch(folder, ONE, 0.2)
 
 

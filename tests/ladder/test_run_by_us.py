@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.ladder.apart import Apart
-from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.attempt import Apart, attempt, navigation_seed
 from endopilot.ladder.ladder import LadderConfig, climb, terms_of
 from endopilot.ladder.submission import check_submission
 from endopilot.ladder.terms import Terms

@@ -13,7 +13,7 @@ from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
-from endopilot.verification.case import STATIC, X_AXIS, Loading, straight_rod
+from endopilot.verification.free_rod import STATIC, X_AXIS, Loading, straight_rod
 
 LENGTH_MM, EI, GJ, EA, ELEMENTS = 40.0, 60.0, 46.0, 900.0, 20
 PUSH_N, PULL_N, TORQUE_N_MM = 0.2, 0.3, 1.5

@@ -18,8 +18,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulatorState, Trajectory
 
 WIRE, STIFF, CATHETER = read_wire("workhorse-014"), read_wire("stiff-014"), read_catheter("microcatheter-1.7f")
 WEAK = replace(WIRE, friction=0.5, push_limit_n=0.006, pull_limit_n=0.002, torque_limit_n_mm=0.003)

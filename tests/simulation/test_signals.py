@@ -13,8 +13,7 @@ import pandas as pd
 from endopilot import _core
 from endopilot.dataset.schema import OWN_COLUMNS, STATE
 from endopilot.simulation.signals import SIGNALS, Outputs, table_columns
-from endopilot.simulation.state import Step
-from endopilot.simulation.trajectory import Trajectory, trajectory_table
+from endopilot.simulation.trajectory import Step, Trajectory, trajectory_table
 from toy_evaluation import make_trajectory
 
 RECORDED = {name: (of, numbers) for name, of, numbers, *_ in _core.OUTPUTS if of in ("device", "sample")}

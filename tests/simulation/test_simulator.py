@@ -16,10 +16,10 @@ from bend import vessel
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.readout import Readout
+from endopilot.simulation.groups import Readout
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.trajectory import SimulatorState
 from endopilot.types import Anatomy
 
 DEVICE = read_wire("workhorse-014")

@@ -17,7 +17,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
 from endopilot.verification import free_rod
-from endopilot.verification.case import Loading
+from endopilot.verification.free_rod import Loading
 
 
 def test_a_stiff_wire_is_dragged_more_than_a_string() -> None:

@@ -13,7 +13,7 @@ from benchmarks.__main__ import main as benchmarks
 from benchmarks.verification import contact, engine, kirchhoff, motion, order, stability, transmission, tube, tubes
 from endopilot.cli import main
 from endopilot.verification import free_rod
-from endopilot.verification.case import Case, compare
+from endopilot.verification.free_rod import Case, compare
 
 KEYS = ["case", "reference", "value", "error", "bar", "passed"]
 

@@ -148,7 +148,8 @@ def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: Angiogr
         "patients": dict(found),
         "version": f"endopilot {__version__}, format {FORMAT_VERSION}",
     }
-    return Layout(Path(output), config, stack, tuple(sources), names, tuple(splits.tolist()), *settled(settings))
+    there = tuple(path.resolve() for path in sources)  # a cluster's workers may stand elsewhere
+    return Layout(Path(output).resolve(), config, stack, there, names, tuple(splits.tolist()), *settled(settings))
 
 
 def is_anatomy(path: Path) -> bool:

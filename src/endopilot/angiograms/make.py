@@ -8,7 +8,6 @@ whole folders, and ends with the same bits as one that was not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE, AngiogramsConfig, Layout, lay_out
-from endopilot.angiograms.masks import CLASSES
 from endopilot.angiograms.write import COCO_FILE, RECORD_FILE, coco, write_cine, write_patient
 from endopilot.dataset.layout import SPLITS
 from endopilot.devices.device import Wire
@@ -130,13 +129,8 @@ def _make(
     if isinstance(where, Workers):
         make_missing(title, paths, partial(work, layout), where if len(paths) > 1 else None)
         return
-    from endopilot.dataset.workers import run_on_cluster  # brings the libraries of data sets
+    from endopilot.dataset.generate import run_on_cluster  # brings the libraries of data sets
 
-    remote = replace(
-        layout,
-        output=layout.output.resolve(),
-        sources=tuple(source.resolve() for source in layout.sources),
-    )
-    missing = [path.resolve() for path in paths if not path.exists()]
+    missing = [path for path in paths if not path.exists()]
     with progress(title, len(missing)) as advance:
-        run_on_cluster(partial(work, remote), missing, lambda path, _: advance(remark=path.name), where)
+        run_on_cluster(partial(work, layout), missing, lambda path, _: advance(remark=path.name), where)

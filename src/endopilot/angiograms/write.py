@@ -16,10 +16,9 @@ from pydicom.valuerep import format_number_as_ds
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.angiograms.cine import KEYPOINTS, Cine, CineFrame
+from endopilot.angiograms.cine import CLASSES, KEYPOINTS, Cine, CineFrame, box_of, encoded, laid_together
 from endopilot.angiograms.config import CT_FILE, Layout, is_anatomy
 from endopilot.angiograms.draw import draw_cine, motion_of
-from endopilot.angiograms.masks import CLASSES, box_of, encoded, laid_together
 from endopilot.files import png_image, write_json, writing
 from endopilot.imaging.segment import segment
 from endopilot.imaging.volume import read_volume, write_volume

@@ -14,8 +14,6 @@ Carotids and subclavian arteries are cut off in the neck and the armpit.
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from jaxtyping import Float
 
@@ -51,7 +49,7 @@ def make_arch(draw: Draw) -> Drawn:
         draw.generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values()))
     )
     bovine = bool(draw.generator.random() < BOVINE_SHARE)
-    return branching.until_it_fits(partial(_draw, draw, sex, kind, bovine), "aortic arch")
+    return branching.until_it_fits("aortic arch", _draw, draw, sex, kind, bovine)
 
 
 def _draw(draw: Draw, sex: str, kind: str, bovine: bool) -> Drawn:

@@ -64,11 +64,11 @@ class SidePlan:
     depth: Depth | None = field(default=None, compare=False)
 
 
-def until_it_fits(draw: Callable[[], Drawn], what: str) -> Drawn:
-    """Draw trees until one fits, whose record states how many failed (`redrawn`); NoShape after 60 draws."""
+def until_it_fits(what: str, draw: Callable[..., Drawn], *given: Any) -> Drawn:
+    """Draw trees from what is given until one fits; its record states how many failed (`redrawn`), NoShape after 60."""
     for attempt in range(60):
         try:
-            tree, drawn = draw()
+            tree, drawn = draw(*given)
         except NoShape:
             continue
         return tree, drawn | {"redrawn": attempt}

@@ -15,7 +15,6 @@ subjects, echo-Doppler, University of Catania; 4 % and 4 % of 212 arteries, Barf
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -51,8 +50,7 @@ def make_cerebral(draw: Draw) -> Drawn:
     trunks = 3 if draw.generator.random() < TRIFURCATION_SHARE else 2
     siphon = branching.truncated(draw, SIPHON_MM, SIPHON_SD_MM, 21.0, 45.0)
     m1 = branching.truncated(draw, M1_MM, M1_SD_MM, 7.0, 38.0)
-    fresh = partial(_draw, draw, side, trunks, siphon, m1)
-    return branching.until_it_fits(fresh, "cerebral arteries")
+    return branching.until_it_fits("cerebral arteries", _draw, draw, side, trunks, siphon, m1)
 
 
 def _draw(

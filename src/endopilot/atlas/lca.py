@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
@@ -84,8 +84,7 @@ def make_lca(draw: Draw) -> Drawn:
     dominance = branching.coronary_dominance(draw.generator.random())
     # Drawn once, so that shapes that fail do not bias it.
     main_mm = None if draw.population.left_main_mm is None else drawn_from(draw, draw.population.left_main_mm)
-    fresh = partial(_draw, draw, dominance, main_mm)
-    return branching.until_it_fits(fresh, "left coronary artery")
+    return branching.until_it_fits("left coronary artery", _draw, draw, dominance, main_mm)
 
 
 def _draw(draw: Draw, dominance: str, main_mm: float | None) -> Drawn:

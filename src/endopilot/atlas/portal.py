@@ -15,7 +15,6 @@ lengths of the right (about 20 mm) and of the left branch's transverse part (abo
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -47,8 +46,7 @@ def make_portal(draw: Draw) -> Drawn:
     shares = np.array(list(VARIANT_SHARES.values()))
     variant = str(draw.generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
     length = branching.truncated(draw, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
-    fresh = partial(_draw, draw, variant, length)
-    return branching.until_it_fits(fresh, "portal vein")
+    return branching.until_it_fits("portal vein", _draw, draw, variant, length)
 
 
 def _draw(draw: Draw, variant: str, main_mm: float) -> Drawn:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -50,9 +49,8 @@ def make_rca(draw: Draw) -> Drawn:
     """Return one right coronary tree and its draws; targets stay when a shape fails, for failures would bias them."""
     for _ in range(10):
         targets = _targets(draw)
-        fresh = partial(_draw, draw, targets)
         with suppress(branching.NoShape):
-            return branching.until_it_fits(fresh, "right coronary artery")
+            return branching.until_it_fits("right coronary artery", _draw, draw, targets)
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.devices.drive_motion import through_play
-from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.devices.robot import DriveConfig, RobotConfig, through_play
 from endopilot.devices.stack import Proximals
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 

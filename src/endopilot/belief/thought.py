@@ -12,7 +12,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 
 Found = TypeVar("Found")
 _CALL = 4000

@@ -13,7 +13,7 @@ from endopilot.devices.device_files import device_file, device_yaml, is_shipped,
 from endopilot.errors import InputError
 from endopilot.simulation.tip_load import tip_load_row
 from endopilot.verification import free_rod
-from endopilot.verification.case import run
+from endopilot.verification.free_rod import run
 
 
 def verify_command() -> Answer:

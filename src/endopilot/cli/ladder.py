@@ -9,7 +9,7 @@ from typing import Any
 from endopilot.cli.arguments import Answer, Existing, OutputFolder
 from endopilot.errors import InputError
 from endopilot.extras import extras_present, require_extras
-from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.ladder.ladder import MISMATCH_FILE, LadderConfig, climb, measure_mismatch
 
 
 def ladder_command(
@@ -50,7 +50,6 @@ def ladder_command(
         return _confirmed(check, dataset, config.policy)
     if dataset is not None:
         require_extras("learn")  # before hours of work
-    from endopilot.ladder.mismatch import MISMATCH_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
 
     name = config.policy.replace(":", ".")

@@ -23,7 +23,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.motion import MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_worlds
-from endopilot.simulation.trajectory import Trajectory, read_trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory, read_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
@@ -90,9 +90,12 @@ def simulate_command(
         if random.stop_short:
             worlds, samples = control.shape[:2]
             frictions = stack.frictions(np.full(worlds, stack.wire.friction))
+            set_up = SimulationSetUp(
+                [patient] * worlds, [stack] * worlds, initial, frictions, "velocity", moves, config
+            )
             with progress("Simulating the wire", total=worlds * samples) as advance:
                 trajectory, stopped = simulate_navigations(
-                    patient, [stack] * worlds, initial, control, frictions, config, advance=advance, **also
+                    set_up, control, record_shape=also["record_shape"], advance=advance
                 )
         else:
             trajectory = simulate(patient, stack, control, initial=initial, config=config, **also)

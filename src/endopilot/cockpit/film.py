@@ -25,8 +25,7 @@ from endopilot.files import reading
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import TRAJECTORY, Trajectory, read_trajectory
+from endopilot.simulation.trajectory import TRAJECTORY, SimulationSetUp, Trajectory, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import Task
 

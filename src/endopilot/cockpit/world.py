@@ -16,7 +16,7 @@ from endopilot.lines import length_along
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection

@@ -14,7 +14,7 @@ from endopilot.control.course import Course
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState, Step
+from endopilot.simulation.trajectory import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.route import Route
 from endopilot.types import Anatomy, TipProjection

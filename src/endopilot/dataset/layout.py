@@ -182,8 +182,9 @@ def make_layout(
     }
     settings, key = settled(settings)
     motions = (world.motion or patient_motion(config, name) for name in names)
-    patients = tuple(map(Patient, map(Path, folders), names, identities, motions))
-    return Layout(Path(output), config, stack, task, robot, world, patients, splits, settings, key)
+    there = (Path(folder).resolve() for folder in folders)  # a cluster's workers may stand elsewhere
+    patients = tuple(map(Patient, there, names, identities, motions))
+    return Layout(Path(output).resolve(), config, stack, task, robot, world, patients, splits, settings, key)
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.layout import identify, version
+from endopilot.dataset.navigations import stacks_with_tips
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
@@ -28,8 +29,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.signals import SIGNALS, Outputs, described
 from endopilot.simulation.simulate import run_set_up
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.simulation.world import World
 from endopilot.types import Anatomy
 
@@ -41,7 +41,10 @@ _MEND = "make the dataset again"
 class Dataset(Outputs):
     """Episodes of equal length. Sample t is the state at the end of period t; `control[:, t]` is the mean over it.
 
-    Device 0 is the wire; the catheters around it follow from the inside out.
+    Device 0 is the wire; the catheters around it follow from the inside out. `command`, simulated again, gives the same
+    navigation to the bit, which `control` does not: a drive that pushes at one speed until it slips strains the wire
+    otherwise than one that is slower from the start. Where no robot made the motions, `decided`, `encoders` and `load`
+    are None; else `command` is what its drives made of what was decided, as the mean over a sample.
 
     Attributes:
         folder: where it was read from.
@@ -50,21 +53,8 @@ class Dataset(Outputs):
         anatomy: name of each episode's anatomy.
         sequence: index of each episode among those of its anatomy.
         split: "train", "seen_test", "calibrate" or "test".
-        device: name of the wire.
-        friction: Coulomb coefficient of each device on the wall.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
-        initial: Δ (mm) and φ (rad) of each device before the first period.
-        command: what the drives were commanded: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
-            Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at
-            one speed until it slips strains the wire otherwise than one that is slower from the start.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
-        tip_abscissa: Δtip, mm.
-        tip_offset: γtip, mm.
-        decided: what the robot was commanded, mm/s and rad/s; None where no robot made the motions, and `command` is
-            what its drives made of that, as the mean over a sample.
-        encoders: inserted length, mm, and rotation, rad, as the robot measured them, likewise.
-        load: force, N, and torque, N·mm, of the drives as the robot measured them, likewise.
         branch: index of the branch that the tip lies in.
         lumen_radius: lumen radius at the tip's projection, mm.
     """
@@ -75,7 +65,6 @@ class Dataset(Outputs):
     anatomy: Shaped[np.ndarray, "episodes"]
     sequence: Int[np.ndarray, "episodes"]
     split: Shaped[np.ndarray, "episodes"]
-    device: Shaped[np.ndarray, "episodes"]
     friction: Float[np.ndarray, "episodes devices"]
     tip_bend: Float[np.ndarray, "episodes"]
     tip_stiffness_factor: Float[np.ndarray, "episodes"]
@@ -114,13 +103,10 @@ class Dataset(Outputs):
         """Return what episodes of one anatomy (read if not given; InputError if missing or another one) were simulated
         with; their `command` then gives them again to the bit."""
         anatomy = anatomy or read_anatomy(self.anatomy_folder(str(self.anatomy[0])))
-        world, given, config = self.world, self.stack, self.manifest["config"]
-        tips = list(zip(self.tip_bend.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
-        drawn = {tip: given.wire.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]) for tip in tips}
-        stacks = {tip: world.stack(replace(given, wire=wire)) for tip, wire in drawn.items()}
+        world, config = self.world, self.manifest["config"]
         return SimulationSetUp(
             anatomies=[world.anatomy(anatomy)] * len(self),
-            stacks=[stacks[tip] for tip in tips],
+            stacks=stacks_with_tips(self.stack, world, self.tip_bend, self.tip_stiffness_factor),
             initial=self.initial,
             friction=self.friction,
             actuation=config["control"],
@@ -274,7 +260,6 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         anatomy=episode["anatomy"].astype(str),
         sequence=episode["sequence"],
         split=episode["split"].astype(str),
-        device=episode["device"].astype(str),
         friction=np.stack([episode[f"{prefix}friction"] for prefix in prefixes], axis=-1),
         tip_bend=episode["tip_bend_rad"],
         tip_stiffness_factor=episode["tip_stiffness_factor"],

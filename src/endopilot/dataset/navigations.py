@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,12 +23,12 @@ from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_shape_memory
-from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
+from endopilot.simulation.world import World
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection, VesselTree
 
 TIP_GROUP = 8  # navigations, from the first on, that share a drawn tip: a simulation has one rod
@@ -48,15 +49,16 @@ class Draw:
     tip_stiffness_factor: Float[np.ndarray, "n"]
     seeds: tuple[tuple[int, int], ...] = ()
 
-    def stacks(self, given: Stack) -> list[Stack]:
-        """Return each navigation's devices: one object for each tip, `given` itself where nothing is drawn."""
-        made = {(given.wire.tip_bend_rad, 1.0): given}
-        tips = list(zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
-        for bend_rad, factor in tips:
-            if (bend_rad, factor) not in made:
-                wire = given.wire.with_tip(bend_rad=bend_rad, stiffness_factor=factor)
-                made[bend_rad, factor] = replace(given, wire=wire)
-        return [made[tip] for tip in tips]
+
+def stacks_with_tips(
+    given: Stack, world: World, tip_bend_rad: Float[np.ndarray, "n"], tip_stiffness_factor: Float[np.ndarray, "n"]
+) -> list[Stack]:
+    """Return each navigation's devices as they are in a world, with the tip drawn for it: one object for each tip."""
+    tips, made = list(zip(tip_bend_rad.tolist(), tip_stiffness_factor.tolist(), strict=True)), dict[Any, Stack]()
+    for bend_rad, factor in dict.fromkeys(tips):
+        wire = given.wire.with_tip(bend_rad=bend_rad, stiffness_factor=factor)
+        made[bend_rad, factor] = world.stack(replace(given, wire=wire))
+    return [made[tip] for tip in tips]
 
 
 def draw_navigations(
@@ -133,27 +135,22 @@ _ROUNDING_MM = 1e-2  # a wire this near to its pull-back target counts as pulled
 
 
 def simulate_navigations(
-    anatomy: Anatomy,
-    stacks: Sequence[Stack],
-    initial: Float[np.ndarray, "worlds devices 2"],
+    set_up: SimulationSetUp,
     control: Float[np.ndarray, "worlds samples devices 2"],
-    friction: Float[np.ndarray, "worlds devices"],
-    config: SimulatorConfig,
     *,
-    actuation: Actuation = "velocity",
-    motion: Motion | None = None,
     robot: RobotConfig | None = None,
     seeds: Sequence[Sequence[int]] = (),
     ostium_mm: float = 0.0,
     record_shape: bool = False,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Trajectory, Bool[np.ndarray, "worlds"]]:
-    """Simulate drawn navigations, and return them and which were stopped short of the vessel's ends. A robot's columns
-    are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the mean of what its
-    drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
+    """Simulate drawn navigations of one anatomy, and return them and which were stopped short of the vessel's ends. A
+    robot's columns are what it was commanded (`decided`) and measured (`encoders`, `load`), its commands, float32, the
+    mean of what its drives made of that; true lengths are `ostium_mm` more than its encoders', mm."""
+    anatomy, stacks, actuation = set_up.anatomies[0], set_up.stacks, set_up.actuation
     watch = _PushRoom(anatomy.tree, stacks)
-    simulator = Simulator(anatomy, stacks, actuation=actuation, motion=motion, config=config)
-    _begin(simulator, watch, initial, friction)
+    simulator = Simulator(anatomy, stacks, actuation=actuation, motion=set_up.motion, config=set_up.config)
+    _begin(simulator, watch, set_up.initial, set_up.friction)
     if record_shape:
         check_shape_memory(len(control), control.shape[1], simulator.nodes)
     recorder = Recorder(simulator, SAMPLE_PERIOD_S, record_shape=record_shape)
@@ -179,9 +176,8 @@ def simulate_navigations(
             step = recorder.step(commanded)
         else:
             robots.motion.command(commanded.astype(float))
-            step = recorder.step(robots.advance(SAMPLE_PERIOD_S))
-            robots.follow(simulator)
-            measured.append(np.concatenate([commanded, robots.read(simulator)], axis=-1))
+            step, read = robots.drive(simulator, SAMPLE_PERIOD_S, recorder.step)
+            measured.append(np.concatenate([commanded, read], axis=-1))
         slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
     trajectory = recorder.trajectory()

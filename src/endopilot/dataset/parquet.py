@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from endopilot.dataset import schema
 from endopilot.errors import InputError
-from endopilot.files import regular
+from endopilot.files import regular, writing
 from endopilot.progress import Advance
 from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
@@ -22,8 +22,8 @@ _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)  # those that LeRobot 0.4 normalises by
 _FEW_VALUES = {"timestamp"}  # columns that repeat their values: a dictionary is the smallest
 
 
-def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:
-    """Return the samples of a trajectory as rows, one episode after the other."""
+def sample_columns(trajectory: Trajectory, first_episode: int) -> dict[str, pa.Array]:
+    """Return the columns of a trajectory's samples, one episode after the other."""
     worlds, samples = trajectory.valid.shape
     signals = trajectory_signals(trajectory)
     columns = {
@@ -42,15 +42,22 @@ def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Tab
     by_robot = set(schema.OF_ROBOT) <= set(trajectory.columns)
     described = schema.features(trajectory.set_up.actuation, trajectory.devices, by_robot=by_robot)
     kinds = {name: (described[name]["dtype"], described[name]["names"]) for name in columns if name in described}
-    return marked_table({name: column(columns[name], *kind) for name, kind in kinds.items()}, key)
+    return {name: column(columns[name], *kind) for name, kind in kinds.items()}
 
 
-def marked_table(columns: Mapping[str, Any], key: str) -> pa.Table:
-    """Return columns as a table that is marked with the dataset's key."""
-    return pa.table(dict(columns)).replace_schema_metadata({_KEY: key.encode()})
+def write_tables(
+    folder: Path, number: int, key: str, *, episodes: Mapping[str, Any], samples: Mapping[str, Any]
+) -> None:
+    """Write the files of the `number`-th block of episodes: its episodes, then its samples, which mark both as whole;
+    both are marked with the dataset's key."""
+    samples_path, episodes_path = schema.paths_of_file(folder, number)
+    for path, columns in ((episodes_path, episodes), (samples_path, samples)):
+        table = pa.table(dict(columns)).replace_schema_metadata({_KEY: key.encode()})
+        with writing(path) as partial:
+            partial.write_bytes(_parquet_bytes(table))
 
 
-def parquet_bytes(table: pa.Table) -> bytes:
+def _parquet_bytes(table: pa.Table) -> bytes:
     """Return a table as a Parquet file in memory, so that a full disk shows as an ordinary OSError on writing."""
     sink = pa.BufferOutputStream()
     floats = {

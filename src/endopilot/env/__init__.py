@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _PERIOD_S, _SECONDS = 2 / 15, 60
-"""As `endopilot.env.episodes.CONTROL_PERIOD_S`, which would bring numpy, and as the reference navigation has it."""
+"""As `endopilot.env.observation.CONTROL_PERIOD_S`, which would bring numpy, and as the reference navigation has it."""
 
 
 def register_envs() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,11 @@ from endopilot.belief.vessels import SharedVessels
 from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.devices.robot import IDEAL, DriveConfig, RobotConfig, read_robot
 from endopilot.errors import InputError
-from endopilot.robot.robot import BACKS_OUT_MM_S
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.engine_simulator import ENGINES
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.robots import Robots, in_grip
-from endopilot.simulation.state import Step
+from endopilot.simulation.robots import Robots, backs_out_mm, in_grip
+from endopilot.simulation.trajectory import Step
 from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.navigation import Navigation
 
@@ -179,13 +179,9 @@ class Reality:
     ) -> Step:
         """Move the devices for a while, by robots if there are some; `time_s` counts from each episode's start."""
         simulator, drawn = self.simulator, self.drawn
-        back = np.zeros(len(time_s))  # by how much each guiding catheter backs out
-        if drawn.backs_out_mm.any():
-            room = np.maximum(simulator.inserted_length.min(axis=1), 0.0)
-            due = time_s >= self._backs_out_s - period_s / 2
-            most = np.minimum(np.minimum(BACKS_OUT_MM_S * period_s, drawn.backs_out_mm), room)
-            back = np.where(due, most, 0.0)
-            drawn.backs_out_mm -= back
+        due = time_s >= self._backs_out_s - period_s / 2
+        back = backs_out_mm(simulator, due, drawn.backs_out_mm, period_s)
+        drawn.backs_out_mm -= back
         if drawn.robots is None:
             travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
             control[..., 0] = within_travel(control[..., 0], simulator.inserted_length, period_s, travel_mm=travel_mm)
@@ -193,12 +189,8 @@ class Reality:
             control[..., 0] -= back[:, None] / period_s
             return simulator.step(control, period_s)
         drawn.robots.motion.command(control)
-        velocity = drawn.robots.advance(period_s)
-        velocity[..., 0] -= back[:, None] / period_s
-        drawn.robots.ostium_mm -= back
-        step = simulator.step(velocity, period_s)
-        drawn.robots.follow(simulator)
-        drawn.readings = drawn.robots.read(simulator)
+        moved = partial(simulator.step, duration_s=period_s)
+        step, drawn.readings = drawn.robots.drive(simulator, period_s, moved, back)
         return step
 
 

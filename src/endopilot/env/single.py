@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
-from endopilot.env.episodes import NavigationState
+from endopilot.env.observation import NavigationState
 from endopilot.env.vector import NavigateVectorEnv, Observations, of_world, refuse_options
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.targets import Place

@@ -20,16 +20,23 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.devices.device import read_wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
-from endopilot.env.episodes import CONTROL_PERIOD_S, Episodes, NavigationState
-from endopilot.env.exposures import CArms
-from endopilot.env.observation import Measured, Observed, observe, observe_exposed, space
-from endopilot.env.picture import Picture
+from endopilot.env.exposures import CArms, Picture
+from endopilot.env.observation import (
+    CONTROL_PERIOD_S,
+    Episodes,
+    Measured,
+    NavigationState,
+    Observed,
+    observe,
+    observe_exposed,
+    space,
+)
 from endopilot.env.reality import Reality
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.targets import Place

@@ -60,14 +60,14 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
                 "frame_index": np.arange(count),
                 "task_index": np.full(count, titles.index(task.title)),
             }
-            data_path, episodes_path = schema.paths_of_file(output, episode)
             chunk, file = divmod(episode, schema.FILES_PER_CHUNK)
             row = {"episode_index": episode, "tasks": [task.title], "length": count}
             row |= {"dataset_from_index": samples, "dataset_to_index": samples + count}
             row |= {"data/chunk_index": chunk, "data/file_index": file} | about
             row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-            _write(episodes_path, {name: [value] for name, value in row.items()}, key)
-            _write(data_path, {name: _column(columns[name], each) for name, each in described.items()}, key)
+            stored = {name: _column(columns[name], each) for name, each in described.items()}
+            rows = {name: [value] for name, value in row.items()}
+            parquet.write_tables(output, episode, key, episodes=rows, samples=stored)
             for name, values in columns.items():
                 white = np.concatenate([image.reshape(-1) for image in values]) / 255 if name in _VIEWS else None
                 sums.add(name, np.asarray(values) if white is None else white)
@@ -138,11 +138,6 @@ def _navigation(submission: Submission, task: Task, place: int) -> tuple[dict[st
     names = ("success", "safe", "reason", "peak_force_n", "exposures")
     about = {"ladder_task": task.name, "anatomy": navigation.anatomy.name, "seed": seed}
     return columns, about | {name: getattr(record, name) for name in names}
-
-
-def _write(path: Path, table: Mapping[str, Any], key: str) -> None:
-    with writing(path) as partial:
-        partial.write_bytes(parquet.parquet_bytes(parquet.marked_table(table, key)))
 
 
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])

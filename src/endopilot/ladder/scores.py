@@ -66,7 +66,7 @@ def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def decision_ms(results: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
     """Return how long the decisions of some navigations took, ms, median and 99th percentile; None if untold."""
-    took_s = np.concatenate([one.get("decision_s", ()) for one in results])
+    took_s = np.concatenate([(), *(one.get("decision_s", ()) for one in results)])
     if not len(took_s):
         return None
     median, most = (1e3 * np.quantile(took_s, [0.5, 0.99])).round(2).tolist()

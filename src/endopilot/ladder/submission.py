@@ -301,19 +301,12 @@ def _driven_again(submission: Submission, folder: Path, pool: Workers | None, at
         for place, entry in enumerate(submission.navigations[task.name])
     }
     for path, entry in entries.items():
-        write_json(path, entry.recording)
+        write_json(path, entry)
     work = partial(_repeat, terms=terms, policy=policy if at_hand else None)
     bad = each(f"Checking {policy}", list(entries), work, pool)
-    again = {path: {} if path in bad else read_json(path) for path in entries}
-    otherwise = {path for path, figures in again.items() if not figures.pop("decided", False)} if at_hand else ()
-    took_ms = decision_ms([{"decision_s": figures.pop("decision_s", ())} for figures in again.values()])
-    found = {
-        path: str(bad[path])
-        if path in bad
-        else _difference(entry.figures(), again[path]) or (f"{policy} decides otherwise" if path in otherwise else None)
-        for path, entry in entries.items()
-    }
-    differing = [f"task {path.parent.name}, patient {int(path.stem)}: {said}" for path, said in found.items() if said]
+    again = {path: read_json(path) for path in entries if path not in bad}
+    took_ms = decision_ms(list(again.values()))
+    differing = [f"task {at.parent.name}, patient {int(at.stem)}: {bad[at]}" for at in entries if at in bad]
     rows = []
     if differing:
         differing[0] += f" ({len(differing)} of {len(entries)} navigations differ)"
@@ -357,14 +350,19 @@ def recorded_navigation(path: Path, name: str | None, place: int) -> tuple[Task,
 
 
 def _repeat(path: Path, *, terms: Terms, policy: str | None) -> None:
-    """Drive the recording in a file again, and put the figures in its place, and whether a policy decides so."""
-    task, place = terms.task(path.parent.name), int(path.stem)
+    """Drive the recording of the entry in a file again, and put the figures in its place; InputError where they are
+    others, or a policy decides otherwise."""
+    task, place, entry = terms.task(path.parent.name), int(path.stem), NavigationEntry(**read_json(path))
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
-    recording = Recording.unpacked(read_json(path), len(navigation.devices), terms)
+    recording = Recording.unpacked(vars(entry.recording), len(navigation.devices), terms)
     figures = {"patient": navigation.anatomy.name} | repeat(recording, navigation, seed=seed)
+    if difference := _difference(entry.figures(), figures):
+        raise InputError(difference)
     if policy is not None:
         done = attempt(policy, navigation, seed=seed, terms=terms)
-        figures |= {"decided": done["sha256"] == figures["sha256"], "decision_s": done["decision_s"]}
+        if done["sha256"] != figures["sha256"]:
+            raise InputError(f"{policy} decides otherwise")
+        figures["decision_s"] = done["decision_s"]
     write_json(path, figures)
 
 

@@ -142,12 +142,10 @@ class OpenLoop:
 
     Attributes:
         tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
-        proximal: x^prox = (Δ mm, φ rad), the exact integral of `control`; the true one in P1.
         control: π = (mm/s, rad/s); the true one in P1.
     """
 
     tip: Steps2
-    proximal: Steps2
     control: Steps2
 
 

@@ -217,13 +217,12 @@ class TransformerPredictor:
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
             batch = Windows.of(episodes.select(chosen))
             parts.append(_rollout_batch(*networks, self.limits, batch))
-        tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
-        return OpenLoop(tip=tip, proximal=proximal, control=control)
+        return OpenLoop(*(np.concatenate(signal) for signal in zip(*parts, strict=True)))
 
 
 def _rollout_batch(
     forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows
-) -> tuple[Steps2, Steps2, Steps2]:
+) -> tuple[Steps2, Steps2]:
     desired = batch.tip
     tip, control = desired.clone(), batch.control.clone()
     proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls
@@ -238,4 +237,4 @@ def _rollout_batch(
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)
             tip[:, k] = forward(tip[:, k - WINDOW : k], proximal[:, moved].float(), control[:, moved])
-    return tuple(signal[:, WINDOW:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
+    return tip[:, WINDOW:].double().numpy(), control[:, WINDOW:].double().numpy()

@@ -36,7 +36,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.trajectory import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 FAMILY = Family([each for each in HYPOTHESES if each.name not in (LUMEN, REGISTRATION, DRIFT)])
@@ -82,8 +82,7 @@ class SimulatedWires:
             paths = _replayed(anatomy, data, members, data.tip.shape[1])
             weight = weights(paths[:, :, :WINDOW], data.tip[:, :WINDOW].astype(float))
             tip[chosen] = weighted_median(paths[:, :, WINDOW:], weight)
-        given = (each[:, WINDOW:].astype(float) for each in (episodes.proximal, episodes.control))
-        return OpenLoop(tip, *given)
+        return OpenLoop(tip=tip, control=episodes.control[:, WINDOW:].astype(float))
 
     def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
         """P2: predict the controls that bring about the true tip."""
@@ -110,9 +109,7 @@ class SimulatedWires:
                 config=data.simulator,
                 motion=data.known_motions.get(anatomy.name),
             )
-        start = episodes.proximal[:, WINDOW - 1 : WINDOW].astype(float)
-        proximal = start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
-        self.tracked[episodes] = OpenLoop(tip=tip, proximal=proximal, control=control)
+        self.tracked[episodes] = OpenLoop(tip=tip, control=control)
         return self.tracked[episodes]
 
     def _believed(

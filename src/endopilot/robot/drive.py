@@ -28,8 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.drive_motion import DriveMotion
-from endopilot.devices.robot import RobotConfig
+from endopilot.devices.robot import DriveMotion, RobotConfig
 from endopilot.errors import InputError
 from endopilot.robot.robot import CYCLE_S
 

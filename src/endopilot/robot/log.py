@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from endopilot.devices.drive_motion import through_play
-from endopilot.devices.robot import DriveConfig
+from endopilot.devices.robot import DriveConfig, through_play
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, box_text
 from endopilot.files import writing

@@ -12,15 +12,13 @@ from jaxtyping import Float
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
-from endopilot.simulation.robots import Recorder, Robots
+from endopilot.simulation.robots import Recorder, Robots, backs_out_mm
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
+from endopilot.simulation.trajectory import Step
 
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
 time step, a quarter of it, doubles what a navigation costs that plans nothing, and changes none of its figures."""
-BACKS_OUT_MM_S = 5.0
-"""Speed at which a guiding catheter backs out of the ostium, mm/s: an assumption."""
 
 
 @dataclass(frozen=True)
@@ -104,25 +102,13 @@ class SimulatedRobot:
         """Let the robot and its devices run for whole cycles, s, and return the largest wall force on a node, N."""
         period, peak = self.recorder.period_s, 0.0
         for _ in range(max(1, round(duration / period))):
-            back_mm = self._backed_out_mm(period)
-            velocity = self._robots.advance(period)
-            if back_mm:
-                velocity[..., 0] -= back_mm / period
-                self._robots.ostium_mm -= back_mm
-            self.last_step = step = self.recorder.step(velocity)
-            self._robots.follow(self._simulator)
-            self._readings.append(self._robots.read(self._simulator)[0])
-            peak = max(peak, float(step.contact_force_max[0]))
+            due = self._robots.motion.time_s >= self._backs_out_s - period / 2
+            back_mm = backs_out_mm(self._simulator, due, self._backs_out_mm, period)
+            self._backs_out_mm -= float(back_mm[0])
+            self.last_step, read = self._robots.drive(self._simulator, period, self.recorder.step, back_mm)
+            self._readings.append(read[0])
+            peak = max(peak, float(self.last_step.contact_force_max[0]))
         return peak
-
-    def _backed_out_mm(self, period: float) -> float:
-        """Return by how much the guiding catheter backs out in the next cycle, mm."""
-        if not self._backs_out_mm or self._robots.motion.time_s < self._backs_out_s - period / 2:
-            return 0.0
-        room = max(0.0, float(self._simulator.inserted_length.min()))
-        back_mm = min(BACKS_OUT_MM_S * period, self._backs_out_mm, room)
-        self._backs_out_mm -= back_mm
-        return back_mm
 
     @property
     def proximal(self) -> Float[np.ndarray, "devices 2"]:

@@ -19,6 +19,7 @@ from endopilot.simulation.config import (
     LANES,
     Actuation,
     CoreMotion,
+    CoreTransmission,
     Lumen,
     Options,
     Processor,
@@ -28,8 +29,7 @@ from endopilot.simulation.config import (
     gpu_errors,
     wall_stiffness,
 )
-from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.tubes import TransmissionLayout, TubeLayout
+from endopilot.simulation.rod import RodLayout, TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3  # a node's displacement (mm) in a Newton step at most; larger ones tangle the wire
@@ -115,7 +115,7 @@ def make_simulation(
     config: SimulatorConfig,
     tubes: TubeLayout | None = None,
     motion: CoreMotion | None = None,
-    transmission: TransmissionLayout | None = None,
+    transmission: CoreTransmission | None = None,
     loads: _core.Loads | None = None,
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
@@ -142,7 +142,7 @@ def make_simulation(
             drives=core.make_drives(limits),
             tubes=None if tubes is None else tubes.model(config.processor),
             motion=motion,
-            transmission=None if transmission is None else transmission.model(config.processor),
+            transmission=transmission,
             worlds=worlds,
         )
 

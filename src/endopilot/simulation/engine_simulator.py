@@ -21,7 +21,7 @@ from endopilot.simulation.core import insertion_arguments
 from endopilot.simulation.groups import Group, prepared
 from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulatorState, Step
+from endopilot.simulation.trajectory import SimulatorState, Step
 
 _RESULTANT_MM = 2.0  # length of wire whose forces of the wall are added up, mm, as the core does
 _NOT_FINITE, _THROUGH_WALL = 1, 3  # reasons of an invalid world

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.drive_motion import DriveMotion
-from endopilot.devices.robot import RobotConfig
+from endopilot.devices.robot import DriveMotion, RobotConfig
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import Step, Trajectory
 
 
 class Recorder:
@@ -29,10 +27,6 @@ class Recorder:
         self._commands: list[np.ndarray] = []
         self._steps: list[Step] = []
         self._shapes: list[np.ndarray] | None = [] if record_shape else None
-
-    def __len__(self) -> int:
-        """Return the number of steps so far."""
-        return len(self._steps)
 
     def step(self, control: ArrayLike) -> Step:
         """Drive every world for a period, as `Simulator.step` does."""
@@ -74,6 +68,22 @@ def in_grip(stack: Stack, robot: RobotConfig, core: SimulatorConfig) -> tuple[St
     return held, replace(core, wall_stiffness_n_mm=wall_stiffness(core, stack.push_limit_n))
 
 
+BACKS_OUT_MM_S = 5.0
+"""Speed at which a guiding catheter backs out of the ostium, mm/s: an assumption."""
+
+
+def backs_out_mm(
+    simulator: Simulator,
+    due: bool | Bool[np.ndarray, "worlds"],
+    left_mm: float | Float[np.ndarray, "worlds"],
+    period_s: float,
+) -> Float[np.ndarray, "worlds"]:
+    """Return by how much guiding catheters back out in a period, mm: where that is due, no farther than is left, and no
+    device is taken back behind the ostium."""
+    room = np.maximum(simulator.inserted_length.min(axis=1), 0.0)
+    return np.where(due, np.minimum(np.minimum(BACKS_OUT_MM_S * period_s, left_mm), room), 0.0)
+
+
 class Robots:
     """What moves the devices of some worlds, and what is measured of them; worlds are independent.
 
@@ -101,13 +111,22 @@ class Robots:
         counted = self._counted(simulator)
         self.motion = DriveMotion(configs, limits, counted, seeds=[[*seed, 7] for seed in seeds])
 
-    def advance(self, duration: float) -> Float[np.ndarray, "worlds devices 2"]:
-        """Let some time pass, s, and return the mean velocities with which the drives move the devices in it."""
-        return self.motion.advance(duration) / duration
-
-    def follow(self, simulator: Simulator) -> None:
-        """Take from where the devices have come to that some did not follow."""
+    def drive(
+        self,
+        simulator: Simulator,
+        duration: float,
+        step: Callable[[Float[np.ndarray, "worlds devices 2"]], Step],
+        back_mm: float | Float[np.ndarray, "worlds"] = 0.0,
+    ) -> tuple[Step, Float[np.ndarray, "worlds devices 4"]]:
+        """Let the devices move for some time, s, by `step` with the drives' mean velocities, while guiding catheters
+        back out; return the step and a reading. Drives take from where devices have come to that some did not follow.
+        """
+        velocity = self.motion.advance(duration) / duration
+        velocity[..., 0] -= np.reshape(back_mm, (-1, 1)) / duration
+        self.ostium_mm -= back_mm
+        made = step(velocity)
         self.motion.position = self._counted(simulator)
+        return made, self.read(simulator)
 
     def reset(
         self,

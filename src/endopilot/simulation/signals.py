@@ -129,9 +129,11 @@ class Outputs:
     valid: Bool[np.ndarray, "*each"]
 
 
+@described
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SolvedOutputs(Outputs):
-    """What the core records, with how hard it was to solve for, which data sets do without."""
+class Step(Outputs):
+    """What all worlds did in one call of `Simulator.step`, with a row a world, and how hard it was to solve for, which
+    data sets do without."""
 
     iterations: Float[np.ndarray, "*each"]
     node_iterations: Float[np.ndarray, "*each"]

@@ -17,8 +17,7 @@ from endopilot.simulation.checks import check_control, check_memory, check_shape
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import SimulationSetUp
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 WALL_FORCE_LIMIT_N = 0.7

@@ -26,11 +26,9 @@ from endopilot.settings import public
 from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, gpu_errors
 from endopilot.simulation.core_state import run_along
-from endopilot.simulation.groups import Group, group_key, make_groups
+from endopilot.simulation.groups import Group, Readout, group_key, make_groups
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.readout import Readout
-from endopilot.simulation.state import SimulationSetUp, SimulatorState, Step
-from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, SimulatorState, Step, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at

@@ -1,4 +1,4 @@
-"""What simulated devices did, sample by sample, and what they were simulated with: `Trajectory`, its files and tables.
+"""What devices are simulated with and what they did, sample by sample: `SimulationSetUp`, `Step` and `Trajectory`.
 
 =======================  ==========================================================================================
 suffix                   content
@@ -13,7 +13,8 @@ suffix                   content
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,15 +31,76 @@ from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, regular, writing
 from endopilot.settings import public
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, place
-from endopilot.simulation.signals import SIGNALS, SolvedOutputs, described, table_columns
-from endopilot.simulation.state import SimulationSetUp
+from endopilot.simulation.signals import SIGNALS, Step, described, table_columns
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure  # slow to import
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationSetUp:
+    """What worlds are simulated with: a `Simulator` made of it and the same commands give the same bits.
+
+    Attributes:
+        anatomies: the vessel of each world; `stacks` its devices.
+        initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
+            on its way already.
+        friction: Coulomb coefficient of each device on the wall.
+        actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
+        motion: how every vessel moves with time; None where they lie still.
+    """
+
+    anatomies: Sequence[Anatomy]
+    stacks: Sequence[Stack]
+    initial: Float[np.ndarray, "worlds devices 2"]
+    friction: Float[np.ndarray, "worlds devices"]
+    actuation: Actuation
+    motion: Motion | None
+    config: SimulatorConfig
+
+    @property
+    def largest(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Largest magnitudes that commands may have: mm/s and rad/s, or N and N·mm, with a hair for rounding."""
+        fastest = np.array([stack.fastest for stack in self.stacks]) * (1 + 1e-6)
+        return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
+
+
+@contextmanager
+def _stored(path: Path | str, what: str, mend: str) -> Iterator[Any]:
+    """Open an .npz file; InputError if it is missing, or `what` the block takes out of it is not there."""
+    try:
+        with np.load(regular(path), allow_pickle=False) as stored:
+            yield stored
+    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
+        raise InputError(f"{path}: no {what} ({error}); {mend}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorState:
+    """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
+    `values` is an array for each pair of anatomy and device, a row a world; `fingerprint` a hash of what it belongs to.
+    """
+
+    values: tuple[Float[np.ndarray, "_ _"], ...]
+    fingerprint: str
+
+    def write(self, path: Path | str) -> None:
+        """Write the state to an .npz file, whole or not at all."""
+        arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
+        with writing(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def read(path: Path | str) -> SimulatorState:
+        """Read a state; InputError if the file is missing or is no saved state."""
+        with _stored(path, "saved state of a simulator", "write one with SimulatorState.write") as stored:
+            count = sum(name.startswith("values_") for name in stored.files)
+            return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
+
 
 TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
 FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else
@@ -48,7 +110,7 @@ _REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went throug
 
 @described
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trajectory(SolvedOutputs):
+class Trajectory(Step):
     """The recorded motion of the devices of simulated worlds, one sample every `period_s`.
 
     Sample t is the state at the end of period t, and `command[:, t]` held over that period. Device 0 is the wire; the
@@ -189,7 +251,7 @@ class Trajectory(SolvedOutputs):
             for each in fields(self)
             if each.name not in ("start", "reason") and isinstance(value := getattr(self, each.name), np.ndarray)
         }
-        tip = TipProjection(**{name: take(getattr(self.tip, name)) for name in TipProjection.__dataclass_fields__})
+        tip = TipProjection(**{name: take(each) for name, each in vars(self.tip).items()})
         return replace(self, tip=tip, columns={name: take(each) for name, each in self.columns.items()}, **chosen)
 
 
@@ -200,7 +262,7 @@ def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:
         for each in fields(trajectory)
         if isinstance(value := getattr(trajectory, each.name), np.ndarray)
     }
-    arrays |= {f"tip_{name}": getattr(trajectory.tip, name) for name in TipProjection.__dataclass_fields__}
+    arrays |= {f"tip_{name}": each for name, each in vars(trajectory.tip).items()}
     set_up = trajectory.set_up
     arrays |= {"initial": set_up.initial, "friction": set_up.friction, "control": trajectory.control}
     return arrays | trajectory.columns
@@ -230,17 +292,14 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file; without its anatomy (of all worlds, or one for each) it is not replayed or
     plotted. Raises InputError for another file, version or vessel."""
-    try:
-        with np.load(regular(path), allow_pickle=False) as stored:
-            about = json.loads(str(stored["about"]))
-            arrays = {name: stored[name] for name in stored.files if name != "about"}
+    with _stored(path, "trajectory", "give a file that Trajectory.write made") as stored:
+        about = json.loads(str(stored["about"]))
+        arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
-        raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
-    missing = {each.name for each in fields(SolvedOutputs)} - arrays.keys()
+    missing = {each.name for each in fields(Step)} - arrays.keys()
     if missing:
         raise InputError(f"{path}: lacks {', '.join(sorted(missing))}, which this version records; simulate it again")
     vessels = _vessels(path, about, anatomy)

@@ -155,7 +155,7 @@ class World:
     def drawn(self, anatomy: Anatomy, seed: int) -> World:
         """Return the world with what a navigation's seed draws: the sides, also of the catheter's lean."""
         change = drawn_sides(self.share, np.random.default_rng([seed, 3]))
-        world = replace(_differing(change, anatomy, self), share=0.0) if self.share else self
+        world = replace(differing(change, anatomy, self), share=0.0) if self.share else self
         return world.leaning(seed)
 
     def leaning(self, seed: int) -> World:
@@ -219,7 +219,8 @@ class World:
 
     def real_robot(self, given: RobotConfig) -> RobotConfig:
         """Return the robot as it truly is."""
-        return (self.robot or given).delayed(self.latency_factor)
+        robot = self.robot or given
+        return replace(robot, latency_s=robot.latency_s * self.latency_factor)
 
     def write(self, path: Path | str) -> None:
         """Write what differs as a YAML file for `read_world`, whole or not at all; InputError if that fails."""
@@ -253,13 +254,9 @@ def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
     return dict(zip(QUANTITIES, (share * random.choice([-1.0, 1.0], 4)).tolist(), strict=True))
 
 
-def world_by(change: Mapping[str, float], anatomy: Anatomy) -> World:
-    """Return the world whose `QUANTITIES` differ by a share; the unit of its place is the ostium's lumen."""
-    return _differing(change, anatomy, World())
-
-
-def _differing(change: Mapping[str, float], anatomy: Anatomy, world: World) -> World:
-    """Return a world in which quantities differ by a share where they did not differ before."""
+def differing(change: Mapping[str, float], anatomy: Anatomy, world: World) -> World:
+    """Return a world in which some of `QUANTITIES` differ by a share where they did not differ before; the unit of the
+    ostium's place is its lumen."""
     diameter_mm, nominal = 2 * float(anatomy.tree.branches[0].centerline.radius[0]), World()
     values = {
         "friction_factor": 1 + change.get("friction", 0.0),
