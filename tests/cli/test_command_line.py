@@ -9,13 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from tyro.conf import Positional
 
 from endopilot.cli import COMMANDS, GROUPS, command_of, main
-from endopilot.cli.arguments import OutputFolder, show
+from endopilot.cli.arguments import show
 from endopilot.cli.options import LISTED_AT_MOST, Command, Option
 from endopilot.errors import InputError
 from endopilot.files import read_yaml
+from endopilot.runs import OutputFolder
 from endopilot.settings import Count, Positive, Seed, read_settings, settings
 
 
@@ -151,7 +151,7 @@ FIVE_ROUNDS = SearchConfig(rounds=5)
 
 
 def search(
-    patient: Positional[Path],
+    patient: Path,
     /,
     *,
     output: OutputFolder,
@@ -258,7 +258,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said) -> None:
     [
         (["p"], "Missing from endopilot search: -o DIR, --output DIR"),
         (["-o", "o"], "Missing from endopilot search: PATIENT"),
-        (["p", "-o", "o", "--config"], "--config: names no file; give one"),
+        (["p", "-o", "o", "--config"], "argument --config: expected one argument"),
         (["p", "-o", "o", "--force", "-1"], "force: -1.0; give a positive number"),
     ],
 )

@@ -228,7 +228,7 @@ def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
     from endopilot.pipeline.navigation import navigate_into
 
     folder, config = tmp_path / "navigation", NavigateConfig(seconds=2.0)
-    navigate_into(vessel, "0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
+    navigate_into(vessel, target="0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
     film = shown(open_film(tmp_path / "navigation", vessel))
     last = film.frames[-1].snapshot
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)

@@ -69,7 +69,7 @@ def test_the_cockpits_catheters(right_artery, tmp_path, capsys):
         ("simulate {patient} --seed abc", "--seed: 'abc'; give a whole number"),
         ("simulate {patient} --sequences 2.5", "--sequences: '2.5'; give a whole number"),
         ("phantom {patient} --slice-mm thin", "--slice-mm: 'thin'; give a number"),
-        ("segment mask.nrrd --picture slices.jpeg2", "slices.jpeg2: a picture is written as PNG"),
+        ("segment mask.nrrd --picture slices.jpeg2", "slices.jpeg2: is written as .png; end the name so"),
         (
             "simulate {patient} --controls aside.csv",
             "aside.csv: row 1 holds one name and then numbers; exchange rows",

@@ -35,7 +35,7 @@ from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline.navigation import navigate_into
 from endopilot.progress import progress
-from endopilot.runs import claim
+from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
@@ -150,10 +150,20 @@ class _Run:
         return self.output / "training" if self.trains else Path(WIRES)
 
 
-def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Run all stages on synthetic patients, from their CT volumes alone; write `output`/report.html, and return its
-    path and figures. Raises InputError where a stage's library is missing, the folder is another run's, or too few
-    patients could be segmented."""
+def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = DemoConfig()) -> dict[str, Any]:
+    """Run every stage once on synthetic patients: CT angiogram, segmentation, anatomy, simulation, training, report.
+
+    An interrupted demo goes on where it stopped when the same command is given again.
+
+    Args:
+        output: folder of all results; the report is report.html.
+
+    Returns:
+        The report's path, and figures.
+
+    Raises:
+        InputError: A stage's library is missing, the folder is another run's, or too few patients were segmented.
+    """
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
@@ -184,17 +194,29 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
 
 
 def run_volume(
-    volume: Path,
-    output: Path,
-    config: RunConfig,
+    volume: Existing,
+    /,
     *,
+    output: OutputFolder,
+    target: str | None = None,
     series: str | None = None,
     phase: str | None = None,
-    target: str | None = None,
+    config: RunConfig = RunConfig(),
 ) -> dict[str, Any]:
-    """Run all stages on one CT angiogram in HU, as `run_demo`. With a target (a section such as "4" or "LAD", or a
-    point "X,Y,Z" in LPS mm; another one later), the agent drives the wire there, into `output`/navigation. Raises
-    InputError as `read_volume`, `segment` and `navigate`, and where the folder belongs to another run."""
+    """Run every stage on one patient, from the CT angiogram to the report.
+
+    With --target the agent drives the wire to a place of the vessel, as `endopilot navigate` does with its defaults;
+    the page of that navigation is in the folder `navigation`. Simulated wires are evaluated in this
+    patient; --training-seconds trains networks on it instead.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        output: folder of all results; the report is report.html.
+
+    Raises:
+        InputError: As `run_demo`, `read_volume`, `segment` and `navigate`.
+    """
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
@@ -279,7 +301,7 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
 def _navigate(run: _Run, anatomy: Path, target: str) -> dict[str, Any]:
     assert run.navigation is not None
     settings = NavigateConfig(seed=run.config.seed)
-    return navigate_into(anatomy, target, output=run.navigation, device=run.config.device, config=settings)
+    return navigate_into(anatomy, target=target, output=run.navigation, device=run.config.device, config=settings)
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
@@ -320,11 +342,10 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
 
 
 def _report(run: _Run, anatomies: Sequence[Path]) -> None:
-    from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
+    from endopilot.report.report import PatientContent, write_report  # matplotlib and plotly
 
     output = run.output
-    anatomy, replay = _replay(output)
-    scores = _scores(anatomies)
+    replay, scores = _replay(output), _scores(anatomies)
     write_json(output / "scores.json", scores)
     patients = tuple(
         PatientContent(
@@ -336,19 +357,18 @@ def _report(run: _Run, anatomies: Sequence[Path]) -> None:
         )
         for folder in anatomies
     )
-    content = ReportContent(
+    write_report(
+        output / REPORT_FILE,
         title="endopilot: from a CT angiogram to guidewire control",
         origin=f"{run.origin} {UNKNOWN_WIRE}" if not run.trains else run.origin,
         command=run.command,
         patients=patients,
         evaluation=output / "evaluation",
         replay=replay,
-        replay_anatomy=anatomy,
         navigation=run.navigation,
         stage_seconds=run.stages.seconds,
         manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
     )
-    write_report(output / REPORT_FILE, content)
 
 
 def _scores(anatomies: Sequence[Path]) -> dict[str, dict[str, float]]:
