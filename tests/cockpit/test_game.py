@@ -25,7 +25,7 @@ from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.tasks.task import find_task
 
-HIDDEN = {"tip_mm", "offset_mm", "section", "force_n", "wall_force_n", "peak_force_n"}
+HIDDEN = {"tip_mm", "section", "force_n", "peak_force_n"}
 
 
 class Rival:

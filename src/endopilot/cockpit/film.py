@@ -187,7 +187,7 @@ def _film(
             anatomy, stack, actuation=set_up.actuation, motion=set_up.motion, config=replace(set_up.config, threads=1)
         )
         simulator.reset(inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction)
-        step, force_n, before = None, 0.0, simulator.proximal[0]
+        force_n, before = 0.0, simulator.proximal[0]
         for number, command in enumerate([None, *np.repeat(commands, parts, axis=0)]):
             if command is not None:
                 before = simulator.proximal[0]
@@ -197,7 +197,6 @@ def _film(
                 moved = (simulator.proximal[0] - before) * parts / period_s
                 shown = take_snapshot(
                     simulator,
-                    step,
                     cycle=number // every,
                     time_s=number * period_s / parts,
                     force_n=force_n,

@@ -234,7 +234,8 @@ def _style(series: str) -> dict[str, Any]:
 
 def _upper(table: pd.DataFrame, column: str) -> float:
     """Return an upper limit that shows every series whole, unless one runs away from all others."""
-    highest = table.groupby("series")[column].max().dropna().sort_values().tolist()
+    series = [float(line[column].max()) for line in _groups(table, "series").values()]
+    highest = sorted(value for value in series if np.isfinite(value))
     if not highest:
         return 1.0
     return 1.08 * min(highest[-1], 1.5 * highest[max(len(highest) - 2, 0)]) + 1e-6

@@ -225,7 +225,7 @@ def _state(rollout: Trajectory, sample: int, k: int) -> str:
     )
 
 
-def _line(points: np.ndarray, *, color: str, width: float, **how: object) -> go.Scatter3d:
+def _line(points: np.ndarray, *, color: str, width: int | float, **how: object) -> go.Scatter3d:
     x, y, z = points.T
     return go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": color, "width": width}, **how)
 

@@ -16,7 +16,6 @@ import math
 import re
 import secrets
 import shlex
-import signal
 import socket
 import ssl
 import stat
@@ -272,8 +271,8 @@ def _recipe(folder: Path) -> str:
 
 
 async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say: Callable[[str], None]) -> None:
-    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until SIGTERM, or until it
-    is cancelled; `say` is called with each line for people. InputError where the address cannot be listened on."""
+    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until it is cancelled, or a
+    signal ends it; `say` is called with each line for people. InputError where the address cannot be listened on."""
 
     async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if drive.taken:
@@ -282,8 +281,6 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
         else:
             await _obey(drive, reader, writer)
 
-    terminated = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
     listener = listen(host, port)
     server = await asyncio.start_server(
         admit, sock=listener, ssl=context, limit=READ_BYTES,
@@ -291,7 +288,7 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
     )  # fmt: skip
     say(f"listening on {host}:{listener.getsockname()[1]}")
     try:
-        while not terminated.is_set():
+        while True:
             await asyncio.sleep(min(CYCLE_S, max(drive.due - time.monotonic(), 0.0)))
             drive.tick(time.monotonic())
             while drive.news:

@@ -14,7 +14,6 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
 from endopilot.simulation.robots import Recorder, Robots
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.state import Step
 
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
@@ -51,7 +50,7 @@ class Robot(Protocol):
 
 class SimulatedRobot:
     """A robot whose wire, and catheters if it has any, are the one world of a simulator, each with a drive of its own.
-    `recorder` has what they were asked for and truly did in each cycle, `last_step` what in the last; None before."""
+    `recorder` has what they were asked for and truly did in each cycle."""
 
     def __init__(
         self,
@@ -73,7 +72,6 @@ class SimulatedRobot:
         self._backs_out_s, self._backs_out_mm = backs_out
         self._readings: list[Float[np.ndarray, "devices 4"]] = []
         self.recorder = Recorder(simulator, cycle_s)
-        self.last_step: Step | None = None
 
     @property
     def velocity(self) -> Float[np.ndarray, "devices 2"]:
@@ -109,7 +107,7 @@ class SimulatedRobot:
             if back_mm:
                 velocity[..., 0] -= back_mm / period
                 self._robots.ostium_mm -= back_mm
-            self.last_step = step = self.recorder.step(velocity)
+            step = self.recorder.step(velocity)
             self._robots.follow(self._simulator)
             self._readings.append(self._robots.read(self._simulator)[0])
             peak = max(peak, float(step.contact_force_max[0]))
