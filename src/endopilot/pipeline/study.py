@@ -4,7 +4,6 @@ run goes on, and end with report.html, metrics.json and manifest.json."""
 
 from __future__ import annotations
 
-import hashlib
 import re
 import sys
 import time
@@ -38,7 +37,6 @@ from endopilot.progress import progress
 from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.types import Volume
 from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
@@ -144,11 +142,6 @@ class _Run:
         """Whether networks are trained here, rather than simulated wires evaluated."""
         return self.config.training_seconds > 0
 
-    @property
-    def model(self) -> Path:
-        """What is evaluated: this study's networks, or simulated wires."""
-        return self.output / "training" if self.trains else Path(WIRES)
-
 
 def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = DemoConfig()) -> dict[str, Any]:
     """Run every stage once on synthetic patients: CT angiogram, segmentation, anatomy, simulation, training, report.
@@ -219,12 +212,13 @@ def run_volume(
     """
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
-    identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
+    inputs = input_hash(volume, content.files)
+    identity = {"volume_sha256": inputs[volume.name], "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
     folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     stages.do("read", lambda: write_volume(content, copy))
-    notes, inputs = content.notes, input_hash(volume, content.files)
+    notes = content.notes
     for note in notes:
         print(note, file=sys.stderr)
     del content  # up to a gigabyte
@@ -244,14 +238,6 @@ def run_volume(
     anatomies = _anatomies(run, [copy])
     navigation = {} if target is None else _navigate(run, anatomies[0], target)
     return {name: navigation[name] for name in ("outcome", "page") if name in navigation} | _study(run, anatomies)
-
-
-def _digest(volume: Volume) -> str:
-    """Return the SHA-256 of voxels and geometry: of what the run uses, whatever file or series it came from."""
-    digest = hashlib.sha256()
-    for part in (volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction):
-        digest.update(f"{part.dtype} {part.shape} ".encode() + np.ascontiguousarray(part).tobytes())
-    return digest.hexdigest()
 
 
 def _number(path: Path) -> int:
@@ -331,9 +317,11 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
         training = TrainConfig(max_seconds=config.training_seconds, seed=config.seed)
         run.stages.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
 
+    model = output / "training" if trains else Path(WIRES)
+
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(run.model, output=output / "evaluation", config=settings, dataset=output / "dataset")
+        evaluate(model, output=output / "evaluation", config=settings, dataset=output / "dataset")
         report_evaluation(output / "evaluation")
 
     run.stages.do("evaluation", measure)
