@@ -221,6 +221,13 @@ def test_flags_win_over_the_file_which_wins_over_defaults(tmp_path) -> None:
     )
 
 
+def test_a_word_that_begins_with_a_minus_and_a_digit_is_a_value() -> None:
+    plan = command_of("plan").read(["patient", "--target", "-1.5,2,3", "-o", "a-1", "--seconds", "1e2"])
+    assert (plan.target, plan.output, plan.seconds) == ("-1.5,2,3", Path("a-1"), 100.0)
+    read = SEARCH.read(["p", "-o", " o", "--points", "-1e-3", "-.5", "3", "4"])
+    assert (read.points, read.output) == (((-1e-3, -0.5), (3.0, 4.0)), Path(" o"))
+
+
 def test_the_function_is_called_with_all_of_it(tmp_path, capsys) -> None:
     file = tmp_path / "options.yaml"
     file.write_text("patient: p\nweights: {force: 9}\n")

@@ -46,10 +46,10 @@ class Rival:
 
 
 @pytest.fixture
-def played(navigation, xray):
+def played(navigation, xray, recorded):
     world = LiveWorld(replace(navigation, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
-        made = GameSession(Attempt(find_task("straight"), 0), world, xray)
+        made = GameSession(Attempt(find_task("straight"), 0), world, xray, recorded(world))
         yield made
         made.close()
 

@@ -233,11 +233,7 @@ class Command:
                 parser.add_argument(*one.flags, dest=one.name, nargs=count)
         words = [f" {word}" if _NEGATIVE.match(word) else word for word in arguments]  # no flag to argparse
         given = vars(parser.parse_intermixed_args(words))
-        return given | {
-            name: _meant(one.kind, given[name])
-            for name, one in leaves.items()
-            if name in given and one.kind is not bool
-        }
+        return given | {name: _meant(leaves[name].kind, of) for name, of in given.items() if name in leaves}
 
     def help(self, *, everything: bool) -> str:
         """Return the text of `--help`, or of `--help-all` with `everything`."""
@@ -325,6 +321,7 @@ def _meant(kind: Any, words: Any) -> Any:
         kinds = inner[:1] * len(parts) if ... in inner else inner
         return tuple(_meant(one, part) for one, part in zip(kinds, parts, strict=False))
     word = words if isinstance(words, str) else words[0]
+    word = word[1:] if word.startswith(" ") and _NEGATIVE.match(word[1:]) else word
     if origin is Literal:
         return next((one for one in inner if str(one) == word), word)
     with contextlib.suppress(ValueError):

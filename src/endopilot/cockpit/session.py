@@ -29,11 +29,10 @@ AUTOPILOT_SILENCE_S = 1.0  # the autopilot pauses after this time without a mess
 class Session:
     """One world driven from a page, and a policy that may drive; `sight`: may the page show the wire in space?"""
 
-    def __init__(
-        self, world: LiveWorld, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
-    ) -> None:
-        """Take the parts: nothing is kept without a recorder; `policies` are the names that a page may choose from."""
+    def __init__(self, world: LiveWorld, xray: XrayUnit, recorder: Recorder, policies: tuple[str, ...] = ()) -> None:
+        """Take the parts; `policies` are the names that a page may choose from."""
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
+        self._record = recorder.event
         self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
         self.sight = True
@@ -110,8 +109,7 @@ class Session:
         sent = self._think()
         if not self.autopilot.waits:
             self.world.advance()
-            if self._recorder is not None:
-                self._recorder.cycle()
+            self._recorder.cycle()
         snapshot = self.world.snapshot()
         if pulse := self.xray.pulse(snapshot):
             self.world.loop.exposed()
@@ -143,8 +141,7 @@ class Session:
         self.halt("closed")
         self.xray.close()
         self.autopilot.close()
-        if self._recorder is not None:
-            self._recorder.close()
+        self._recorder.close()
 
     def _hear(self, now_s: float) -> None:
         """Take a sign of life of who drives, the first one after a silence perhaps."""
@@ -236,10 +233,6 @@ class Session:
         """Write an exposure into the recording."""
         xray = self.xray
         self._record(exposure=xray.frames, seconds=xray.seconds, kerma_ugy=xray.kerma_ugy)
-
-    def _record(self, **what: Any) -> None:
-        if self._recorder is not None:
-            self._recorder.event(**what)
 
 
 @runtime_checkable
