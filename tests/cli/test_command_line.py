@@ -101,6 +101,13 @@ def test_a_missing_input_is_reported_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_suffix_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder holds no anatomy, which is found out when the work begins."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["simulate", str(tmp_path), "-o", str(tmp_path / "a.txt")])
+    assert "a.txt: is written as .parquet or .csv or .npz; end the name so" in capsys.readouterr().err
+
+
 def test_a_closed_output_is_no_error() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "endopilot.cli", "evaluate", "--help"],
