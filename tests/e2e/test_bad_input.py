@@ -66,9 +66,9 @@ def test_the_cockpits_catheters(right_artery, tmp_path, capsys):
         ("navigate mask.nrrd --target 4", "mask.nrrd: is a file; make an anatomy of it first"),
         ("simulate mask.nrrd", "mask.nrrd: is a file; make an anatomy of it first"),
         ("anatomy {patient}", "{patient}: is an anatomy already; give it to the next command"),
-        ("simulate {patient} --seed abc", "--seed: 'abc'; give a whole number"),
-        ("simulate {patient} --sequences 2.5", "--sequences: '2.5'; give a whole number"),
-        ("phantom {patient} --slice-mm thin", "--slice-mm: 'thin'; give a number"),
+        ("simulate {patient} --seed abc", "seed: 'abc'; give a whole number"),
+        ("simulate {patient} --sequences 2.5", "sequences: '2.5'; give a whole number"),
+        ("phantom {patient} --slice-mm thin", "slice_mm: 'thin'; give a number"),
         ("segment mask.nrrd --picture slices.jpeg2", "slices.jpeg2: is written as .png; end the name so"),
         (
             "simulate {patient} --controls aside.csv",
