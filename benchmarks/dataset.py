@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.cli.arguments import OutputFolder
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
@@ -16,7 +15,7 @@ from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
-from endopilot.runs import claim
+from endopilot.runs import OutputFolder, claim
 from endopilot.settings import Within
 
 PAPER_ANATOMIES, PAPER_SEQUENCES = 100, 1000

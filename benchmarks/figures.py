@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from endopilot.cli.arguments import show, show_rows
+from endopilot.cli.arguments import show
 from endopilot.files import processor_name
 
 T = TypeVar("T")
@@ -96,7 +96,7 @@ def _rows_of(name: str, group: Mapping[str, Mapping[str, Any]]) -> list[dict[str
 
 def _table(rows: list[dict[str, Any]], *, as_json: bool) -> None:
     columns = {name: None for row in rows for name in row}
-    show_rows(rows if as_json else [columns | row for row in rows], as_json=as_json)
+    show(rows if as_json else [columns | row for row in rows], as_json=as_json)
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float, float]:

@@ -23,7 +23,7 @@ from endopilot.tasks.targets import Place
 ROOT = Path(__file__).parents[1]
 LARGE = {
     "SimpleITK", "gymnasium", "jinja2", "matplotlib", "numpy", "pandas", "plotly", "pyarrow", "pydantic", "pydicom",
-    "pyvista", "scipy", "skimage", "torch", "tyro", "vtk", "vtkmodules", "yaml",
+    "pyvista", "scipy", "skimage", "torch", "vtk", "vtkmodules", "yaml",
 }  # fmt: skip
 SLOW = {"Axes": Axes, "Figure": Figure, "Place": Place, "Target": endopilot.Target}
 """What a module imports only to be type-checked."""

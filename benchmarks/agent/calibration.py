@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from tyro.conf import Positional
 
 from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
@@ -238,7 +237,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
     return calibration, lines
 
 
-def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = False) -> str:
+def calibrate_agent(kind: KindName = "assumed", /, *, write: bool = False) -> str:
     """Calibrate the X-ray adviser of the ladder's agents, in the patients to learn on and in some of the ladder.
 
     runs/agent-calibration-KIND gets one file a navigation; an interrupted run goes on with the others.

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.difficulty import Shape, expected
@@ -45,7 +44,7 @@ def targets(anatomy: Anatomy) -> Iterator[tuple[str, str]]:
 
 
 def navigate_coronaries(
-    patients: Positional[tuple[Path, ...]],
+    patients: tuple[Path, ...],
     /,
     *,
     policy: str = "agent",

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tyro.conf import Positional
 
 import endopilot.tasks
 from endopilot.atlas.atlas import make_patient_tree
@@ -214,9 +213,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
     raise InputError(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
 
 
-def choose_patients(
-    tasks: Positional[tuple[str, ...]] = (), /, *, version: LadderVersion = NEWEST, write: bool = False
-) -> None:
+def choose_patients(tasks: tuple[str, ...] = (), /, *, version: LadderVersion = NEWEST, write: bool = False) -> None:
     """Choose the patients of the ladder's tasks, and print their numbers.
 
     Args:

@@ -11,7 +11,6 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.ladder.ladder import CASES, world_of
@@ -49,9 +48,7 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 
 
-def compare_replanning(
-    tasks: Positional[tuple[str, ...]] = TASKS, /, *, case: str = CASES[0], patients: Count = 6
-) -> None:
+def compare_replanning(tasks: tuple[str, ...] = TASKS, /, *, case: str = CASES[0], patients: Count = 6) -> None:
     """Drive the ladder's agent by two rules for replanning, and print a table of each task and of all together.
 
     Args:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tyro.conf import Positional
 
 from benchmarks.figures import markdown_table
 from endopilot.belief.belief import Belief
@@ -58,7 +57,7 @@ def search(navigation: Navigation, table: Table, *, evaluations: int, seed: int)
 
 
 def compare_samplers(
-    versions: Positional[tuple[str, ...]] = ("2",),
+    versions: tuple[str, ...] = ("2",),
     /,
     *,
     patients: Count = 4,

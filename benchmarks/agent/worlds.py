@@ -29,7 +29,6 @@ from benchmarks.figures import Bar, judged
 from endopilot.belief.identification import Identified
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.watch import MISMATCH
-from endopilot.cli.arguments import OutputFolder
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.agent_config import AgentConfig, read_agent_calibration
 from endopilot.files import read_json, write_json
@@ -38,7 +37,7 @@ from endopilot.ladder.terms import Terms
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.navigation.record import NavigationRecord, count_navigation_events
-from endopilot.runs import claim, make_missing
+from endopilot.runs import OutputFolder, claim, make_missing
 from endopilot.settings import Seed, Within
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.world import NOMINAL, World, list_worlds, read_world

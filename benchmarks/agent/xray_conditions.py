@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from tyro.conf import Positional
 
 from benchmarks.figures import DOCS, fill
 from endopilot.control.agent import AgentPolicy
@@ -94,7 +93,7 @@ def row(name: str, results: list[dict[str, Any]]) -> str:
 
 
 def drive_under_conditions(
-    patients: Positional[Count] = 2, /, *, only: tuple[Condition, ...] = get_args(Condition), write: bool = False
+    patients: Count = 2, /, *, only: tuple[Condition, ...] = get_args(Condition), write: bool = False
 ) -> str:
     """Drive the agent with X-ray images, in moving patients, and with both, in the coronary tasks of the ladder.
 

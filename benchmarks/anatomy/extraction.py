@@ -23,10 +23,10 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
+from endopilot.runs import existing
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 from endopilot.vessels.read_source import read_source
 from endopilot.vessels.surface import BAND_MM, distance_map_from_surface, surface_from_mask

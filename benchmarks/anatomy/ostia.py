@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
-from tyro.conf import Positional
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.tree import sampled
-from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.grid import connected_components
 from endopilot.imaging.volume import read_volume
 from endopilot.progress import progress
+from endopilot.runs import existing
 from endopilot.types import Anatomy, LumenMask, Volume
 from endopilot.vessels.read_source import MASK_SUFFIXES
 
@@ -32,7 +31,7 @@ COVERED_RADII = 1.5
 lumens are not round."""
 
 
-def bench_ostia(folder: Positional[Path], /) -> dict[str, Any]:
+def bench_ostia(folder: Path, /) -> dict[str, Any]:
     """Find the coronary ostia of real patients' masks without an aorta, and compare with where they are known to be.
 
     Args:

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.figures import Bar
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume, write_mask
 from endopilot.progress import progress
+from endopilot.runs import existing
 from endopilot.types import LumenMask, Volume
 from endopilot.vessels.surface import Surface, surface_from_mask
 

@@ -18,10 +18,10 @@ from endopilot.angiograms.config import AngiogramsConfig, lay_out
 from endopilot.angiograms.make import make_angiograms
 from endopilot.angiograms.write import write_cine
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.cli.arguments import OutputFolder
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import processor_name
+from endopilot.runs import OutputFolder
 from endopilot.settings import Within
 
 CORES = 2

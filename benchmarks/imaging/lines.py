@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.cli.arguments import Existing
+from endopilot.runs import Existing
 from endopilot.settings import Seed
 from endopilot.types import Anatomy
 from endopilot.xray.camera import CArmCamera, read_camera

@@ -16,9 +16,8 @@ from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scene
 from benchmarks.imaging.xray import SHOWN, Exposure, errors_of, summary
 from endopilot.anatomy.projection import project_tip
 from endopilot.angiograms.draw import view_text
-from endopilot.cli.arguments import OutputFolder
 from endopilot.files import read_json, write_json
-from endopilot.runs import claim
+from endopilot.runs import OutputFolder, claim
 from endopilot.settings import NonNegative, Seed, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy

@@ -22,8 +22,7 @@ from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.tree import sampled
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.cockpit.film import open_film
-from endopilot.cockpit.slicer import EVERY, write_film
+from endopilot.cockpit.film import EVERY, open_film, write_film
 from endopilot.devices.device import read_wire
 from endopilot.imaging.volume import write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom

@@ -19,11 +19,10 @@ from benchmarks.figures import Bar, judged
 from benchmarks.verification.contact import LEAD_MM, TUBE_RADIUS_MM, WIRE_RADIUS_MM, bent_tube
 from benchmarks.verification.tube import straight_tube
 from endopilot.anatomy.distance import sample
-from endopilot.cli.arguments import OutputFolder
 from endopilot.devices.device import Wire, read_wire
 from endopilot.files import read_json, write_json
 from endopilot.navigation.loop import start_world
-from endopilot.runs import claim, make_missing
+from endopilot.runs import OutputFolder, claim, make_missing
 from endopilot.settings import Within
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall

@@ -24,7 +24,7 @@ import endopilot
 from benchmarks.figures import fill
 from endopilot.files import read_json
 from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
-from endopilot.report.replay_figure import replay_figure
+from endopilot.report.figures import replay_figure
 from endopilot.robot.log import Courses
 from endopilot.robot.replay import (
     EpisodeReplay,

@@ -9,14 +9,48 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from endopilot.errors import InputError
-from endopilot.files import PARTIAL, RECORD_FILE, is_empty, json_text, read_json, write_json
+from endopilot.files import PARTIAL, RECORD_FILE, is_empty, json_text, read_json, regular, write_json
 from endopilot.parallel import Workers, each
 
 _LONGEST_VALUE = 60
+
+
+@dataclass(frozen=True)
+class Place:
+    """What lies at a path that a command takes: an "input", which must be there when the command begins, or a "folder"
+    or "file" that is written. A file's name ends in one of `suffixes`, if there are any; those `beside` it are written
+    too."""
+
+    of: Literal["input", "folder", "file"]
+    suffixes: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+
+    def files(self, path: Path) -> list[Path]:
+        """Return the files that are written; InputError for a name without the suffix."""
+        if self.suffixes and not path.name.lower().endswith(self.suffixes):
+            raise InputError(f"{path}: is written as {' or '.join(self.suffixes)}; end the name so")
+        return [path, *map(path.with_suffix, self.beside)] if self.of == "file" else []
+
+
+Existing = Annotated[Path, Place("input")]
+OutputFolder = Annotated[Path, Place("folder")]
+OutputFile = Annotated[Path, Place("file")]
+Picture = Annotated[Path, Place("file", (".png",))]
+Page = Annotated[Path, Place("file", (".html",))]
+
+
+def existing(path: Path) -> Path:
+    """Return `path` if a file or a folder is there; InputError if not, or if it may not be looked at."""
+    try:
+        path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: {(error.strerror or str(error)).lower()}; check the path") from error
+    return regular(path)
 
 
 def claim(folder: Path, command: str, **identity: Any) -> None:

@@ -9,13 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from tyro.conf import Positional
 
 from endopilot.cli import COMMANDS, GROUPS, command_of, main
-from endopilot.cli.arguments import OutputFolder, show
+from endopilot.cli.arguments import show
 from endopilot.cli.options import LISTED_AT_MOST, Command, Option
 from endopilot.errors import InputError
 from endopilot.files import read_yaml
+from endopilot.runs import OutputFolder
 from endopilot.settings import Count, Positive, Seed, read_settings, settings
 
 
@@ -101,6 +101,13 @@ def test_a_missing_input_is_reported_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_suffix_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder holds no anatomy, which is found out when the work begins."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["simulate", str(tmp_path), "-o", str(tmp_path / "a.txt")])
+    assert "a.txt: is written as .parquet or .csv or .npz; end the name so" in capsys.readouterr().err
+
+
 def test_a_closed_output_is_no_error() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "endopilot.cli", "evaluate", "--help"],
@@ -151,7 +158,7 @@ FIVE_ROUNDS = SearchConfig(rounds=5)
 
 
 def search(
-    patient: Positional[Path],
+    patient: Path,
     /,
     *,
     output: OutputFolder,
@@ -221,6 +228,13 @@ def test_flags_win_over_the_file_which_wins_over_defaults(tmp_path) -> None:
     )
 
 
+def test_a_word_that_begins_with_a_minus_and_a_digit_is_a_value() -> None:
+    plan = command_of("plan").read(["patient", "--target", "-1.5,2,3", "-o", "a-1", "--seconds", "1e2"])
+    assert (plan.target, plan.output, plan.seconds) == ("-1.5,2,3", Path("a-1"), 100.0)
+    read = SEARCH.read(["p", "-o", " o", "--points", "-1e-3", "-.5", "3", "4"])
+    assert (read.points, read.output) == (((-1e-3, -0.5), (3.0, 4.0)), Path(" o"))
+
+
 def test_the_function_is_called_with_all_of_it(tmp_path, capsys) -> None:
     file = tmp_path / "options.yaml"
     file.write_text("patient: p\nweights: {force: 9}\n")
@@ -258,7 +272,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said) -> None:
     [
         (["p"], "Missing from endopilot search: -o DIR, --output DIR"),
         (["-o", "o"], "Missing from endopilot search: PATIENT"),
-        (["p", "-o", "o", "--config"], "--config: names no file; give one"),
+        (["p", "-o", "o", "--config"], "argument --config: expected one argument"),
         (["p", "-o", "o", "--force", "-1"], "force: -1.0; give a positive number"),
     ],
 )

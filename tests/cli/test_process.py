@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.cli import main, process
-from endopilot.cli.arguments import show, show_rows
+from endopilot.cli.arguments import show
 from endopilot.cli.process import EXIT_DEFECT, carry_out
 from endopilot.errors import InputError, Remark
 
@@ -242,7 +242,7 @@ def test_what_libraries_write_past_python_stays_off_the_screen():
 
 @pytest.mark.parametrize("name", ["[/b]", "[red]", "a b", "*?"])
 def test_odd_names_are_shown_as_they_are(capsys, name):
-    show_rows([{"patient": name}], as_json=False)
+    show([{"patient": name}], as_json=False)
     show({"patient": f"{name}\n"}, as_json=False)
     assert capsys.readouterr().out.count(name) == 2
 
@@ -250,7 +250,7 @@ def test_odd_names_are_shown_as_they_are(capsys, name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("--nonesuch", "Unrecognized options"),
+        ("--nonesuch", "unrecognized arguments: --nonesuch"),
         ("--sequences x", "--sequences"),
         ("", "Missing"),
         ("--motion-seed -1", "motion_seed: -1; give a whole number from 0"),

@@ -34,11 +34,17 @@ def xray(navigation):
 
 
 @pytest.fixture
-def session(world, xray, vessel, tmp_path):
+def recorded(vessel, tmp_path):
+    """Return a function that makes the recorder of a world."""
     from endopilot.cockpit.recording import Recorder, Where
+
+    return lambda world: Recorder(tmp_path / "a.cockpit.jsonl", world, Where(patient=vessel), 0)
+
+
+@pytest.fixture
+def session(world, xray, recorded):
     from endopilot.cockpit.session import Session
 
-    recorder = Recorder(tmp_path / "a.cockpit.jsonl", world, Where(patient=vessel), 0)
-    made = Session(world, xray, recorder)
+    made = Session(world, xray, recorded(world))
     yield made
     made.close()

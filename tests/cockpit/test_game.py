@@ -25,7 +25,7 @@ from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.tasks.task import find_task
 
-HIDDEN = {"tip_mm", "offset_mm", "section", "force_n", "wall_force_n", "peak_force_n"}
+HIDDEN = {"tip_mm", "section", "force_n", "peak_force_n"}
 
 
 class Rival:
@@ -46,10 +46,10 @@ class Rival:
 
 
 @pytest.fixture
-def played(navigation, xray):
+def played(navigation, xray, recorded):
     world = LiveWorld(replace(navigation, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
-        made = GameSession(Attempt(find_task("straight"), 0), world, xray)
+        made = GameSession(Attempt(find_task("straight"), 0), world, xray, recorded(world))
         yield made
         made.close()
 

@@ -65,7 +65,7 @@ def test_the_vessel_is_sent_again_to_whoever_connects_next(streamed):
 
 
 def test_a_port_that_is_taken_is_named(streamed, session):
-    with pytest.raises(InputError, match=f"igtl: {streamed.port}: .*choose another port"):
+    with pytest.raises(InputError, match=f"igtl: cannot listen on 127.0.0.1:{streamed.port} .*choose others"):
         Streamed(session, lambda: b"", streamed.port)
 
 

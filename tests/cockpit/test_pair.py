@@ -173,9 +173,10 @@ def test_a_policy_drives_both(session):
     assert session.autopilot.status == "drives" or session.autopilot.status == "thinking"
 
 
-def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xray):
+def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xray, recorded):
     curved = replace(navigation.catheters[0], shape=((10.0, 0.5),))
-    session = Session(LiveWorld(replace(navigation, catheters=(curved,))), xray)
+    world = LiveWorld(replace(navigation, catheters=(curved,)))
+    session = Session(world, xray, recorded(world))
     run(session, 0.5, message=both(catheter=(0.0, 3.0)))
     start(session, "in-turn")
     drive_alone(session, lambda: session.autopilot.status == "failed")
@@ -183,13 +184,13 @@ def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xra
     session.close()
 
 
-def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
+def test_a_task_of_wire_and_catheter_is_scored(navigation, xray, recorded):
     """The catheter is to arrive: the wire at the target is not enough. The agent's score stands beside."""
     tried = Attempt(task_by_hand("follow"), 0)
     wanted = replace(navigation.target, abscissa=10.0)
     world = LiveWorld(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
-        played = GameSession(tried, world, xray)
+        played = GameSession(tried, world, xray, recorded(world))
         played.handle(Game(type="game", action="start"), 0.0)
         play(played, both((8.0, 0.0)), 1.5)
         assert world.snapshot().tip.abscissa[0] > 10.0 and played.phase == "on"
@@ -228,7 +229,7 @@ def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
     from endopilot.pipeline.navigation import navigate_into
 
     folder, config = tmp_path / "navigation", NavigateConfig(seconds=2.0)
-    navigate_into(vessel, "0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
+    navigate_into(vessel, target="0,0,15", output=folder, policy="in-turn", catheter=(NAME,), config=config)
     film = shown(open_film(tmp_path / "navigation", vessel))
     last = film.frames[-1].snapshot
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)

@@ -187,9 +187,9 @@ class Slow(Scripted):
 
 
 @pytest.fixture
-def driven(world, xray):
+def driven(world, xray, recorded):
     Scripted.made.clear()
-    made = Session(world, xray, None, POLICIES)
+    made = Session(world, xray, recorded(world), POLICIES)
     yield made
     made.close()
 

@@ -6,8 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from endopilot.cockpit.film import Film, FilmFrame
-from endopilot.cockpit.slicer import EVERY, write_film
+from endopilot.cockpit.film import EVERY, Film, FilmFrame, write_film
 from endopilot.errors import InputError
 from endopilot.vessels import mesh_process
 

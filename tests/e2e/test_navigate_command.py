@@ -57,7 +57,7 @@ def driven(patient, tmp_path_factory):
         world=str(world),
         robot=str(robot),
     )
-    return folder, navigation.navigate_into(patient, "2", output=folder, config=config)
+    return folder, navigation.navigate_into(patient, target="2", output=folder, config=config)
 
 
 def test_the_folder_tells_what_happened(driven, patient):
@@ -261,7 +261,9 @@ def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, pati
 def test_without_the_extras_a_navigation_writes_what_it_can_and_says_what_is_left_out(patient, tmp_path):
     config = NavigateConfig(tip="own", seconds=5.0)
     with patch.object(navigation, "extras_present", lambda: {"learn": False, "report": False}):
-        figures = navigation.navigate_into(patient, "1", output=tmp_path / "bare", policy="forward", config=config)
+        figures = navigation.navigate_into(
+            patient, target="1", output=tmp_path / "bare", policy="forward", config=config
+        )
     written = ["manifest.json", "navigation.csv", "run.json", "trajectory.npz"]
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == written and figures["page"] is None
     assert figures["left_out"] == "files that need: pip install 'endopilot[learn,report]'"

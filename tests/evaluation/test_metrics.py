@@ -140,7 +140,7 @@ def test_a_wire_that_fills_the_lumen_is_at_the_wall_and_a_lost_tip_is_nowhere(re
     filled = replace(true, radius=np.full_like(true.radius, 0.1), offset=true.offset.copy())
     filled.offset[:, 7] = np.nan
     table = figures.safety_table({"test": replace(results["test"], true=filled)})
-    clearance = figures.rows(figures.rows(table, split="test", series="true"), ratio="clearance")
+    clearance = table.query("split == 'test' and series == 'true' and ratio == 'clearance'")
     for name in ("median", "p95"):
-        values = figures.values(clearance, name)
+        values = np.asarray(clearance[name])
         assert np.isnan(values[7]) and (np.delete(values, 7) == 1.0).all()

@@ -21,7 +21,7 @@ from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import check_submission
 from endopilot.ladder.table import tabulate
-from endopilot.report.ladder_page import write_page
+from endopilot.report.ladder_page import write_ladder_page
 from endopilot.tasks.task import find_task, list_tasks
 from endopilot.types import TipProjection
 from toy_tasks import own_tasks
@@ -99,7 +99,7 @@ def test_a_changed_policy_of_one_s_own_is_refused(tmp_path, monkeypatch):
 
 def test_the_page_shows_the_scores_and_links_the_replay(climbed):
     folder, _ = climbed
-    text = write_page(folder).read_text(encoding="utf-8")
+    text = write_ladder_page(folder).read_text(encoding="utf-8")
     assert "The ladder: forward" in text and find_task("straight").title in text
     assert "replay-straight.html" in text and "data:image/png;base64," in text
     replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
@@ -178,7 +178,7 @@ def test_planning_time_is_scored_beside_what_a_submission_confirms(tmp_path):
     (row,) = climb(output=tmp_path / "run", config=LadderConfig(policy="oracle", version=str(tmp_path / "mine")))
     each = [json.loads(path.read_text(encoding="utf-8"))["planning_s"] for path in (tmp_path / "run").glob("along/*")]
     assert len(each) == 2 and min(each) > 0 and row["planning_s"] == pytest.approx(np.mean(each), abs=0.06)
-    assert "<th>Planning, s</th>" in write_page(tmp_path / "run").read_text(encoding="utf-8")
+    assert "<th>Planning, s</th>" in write_ladder_page(tmp_path / "run").read_text(encoding="utf-8")
     assert "planning_s" not in (tmp_path / "run" / "submission.json").read_text(encoding="utf-8")
     assert check_submission(tmp_path / "run" / "submission.json").difference is None
 
@@ -190,7 +190,7 @@ def test_tasks_of_ones_own_are_climbed_scored_by_a_second_rule_and_checked(tmp_p
     # 5 mm/s for 5 s, from 2 to 27 mm: 20 mm is reached, 30 mm is not, but the tip comes within 5 mm of it.
     assert row["success"] == 0.5 and row["near"] == 1.0
     assert check_submission(tmp_path / "run" / "submission.json").difference is None
-    page = write_page(tmp_path / "run").read_text(encoding="utf-8")
+    page = write_ladder_page(tmp_path / "run").read_text(encoding="utf-8")
     assert "<th>Near, %</th>" in page and "a point for each patient" in page
     own_tasks(tmp_path / "mine", seconds=5.0, targets_mm=[[0, 0, 21], [0, 0, 30]])
     list_tasks.cache_clear()

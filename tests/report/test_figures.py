@@ -66,7 +66,7 @@ def test_series_are_drawn_with_their_values(results):
     table = figures.tip_error_table(results)
     ax = figures.tip_error_figure(table, TITLES).axes[0]
     line = next(line for line in ax.get_lines() if "P1" in str(line.get_label()))
-    expected = figures.values(figures.rows(table, split="seen_test", series="P1"), "abscissa_mae_mm")
+    expected = table.query("split == 'seen_test' and series == 'P1'")["abscissa_mae_mm"]
     np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), expected)
     assert ax.get_xlabel().endswith(", s")
     assert ax.get_ylabel().endswith(", mm")
@@ -78,9 +78,9 @@ def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
     for ax, ratio in ((axes[1], "clearance"), (axes[3], "radius")):
         lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()]
         for series in ("true", "P3", "P4"):
-            part = figures.rows(table, split="test", series=series, ratio=ratio)
+            part = table.query(f"split == 'test' and series == '{series}' and ratio == '{ratio}'")
             for column in ("median", "p95"):
-                expected = figures.values(part, column)
+                expected = part[column]
                 assert any(len(line) == len(expected) and np.allclose(line, expected) for line in lines)
         assert any(np.allclose(line, 1.0) for line in lines)  # the wall
     assert axes[3].get_ylabel().endswith("γ / r")
@@ -89,12 +89,11 @@ def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
 def test_the_boxes_of_control_errors_are_those_of_the_series(results):
     table = figures.control_error_table(results)
     figure = figures.control_error_figure(table, TITLES)
-    series = figures.distinct(table, "series")
+    series = table["series"].unique()
     assert len(series) >= 4 and len(figure.axes) == 4
     medians = [line.get_xdata()[0] for line in figure.axes[2].lines if line.get_color() == figures.BLACK]
     shown = [
-        np.median(figures.values(figures.rows(table, split="test", series=name), "translation_rmse_mm_s"))
-        for name in series
+        np.median(table.query(f"split == 'test' and series == '{name}'")["translation_rmse_mm_s"]) for name in series
     ]
     np.testing.assert_allclose(medians[: len(shown)], shown)
 

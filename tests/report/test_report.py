@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-import dataclasses
 import html
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from endopilot.evaluation import evaluate
 from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.volume import write_mask, write_volume
 from endopilot.report import report
-from endopilot.report.report import PatientContent, ReportContent, write_report
+from endopilot.report.report import PatientContent, write_report
 from endopilot.report.report_text import tip_rows
 from endopilot.types import LumenMask, Volume
 
@@ -44,7 +44,7 @@ def material(tmp_path_factory, anatomy, results):
     return folder
 
 
-def make_content(folder, rollout) -> ReportContent:
+def make_content(folder, rollout) -> dict[str, Any]:
     patient = PatientContent(
         name="tube <1>",
         anatomy=folder / "anatomy",
@@ -52,27 +52,26 @@ def make_content(folder, rollout) -> ReportContent:
         mask=folder / "mask.nii.gz",
         scores={"dice": 0.9123, "radius_mae_mm": 0.1},
     )
-    return ReportContent(
-        title="A tube",
-        origin="One tube, made up for a test.",
-        command="endopilot demo --seed 7",
-        patients=(patient,),
-        evaluation=folder / "evaluation",
-        replay=rollout,
-        replay_anatomy=folder / "anatomy",
-        stage_seconds={"atlas": 1.5, "training": 20.25},
-        manifest=manifest(config={"patients": 1}, seed=7),
-    )
+    return {
+        "title": "A tube",
+        "origin": "One tube, made up for a test.",
+        "command": "endopilot demo --seed 7",
+        "patients": (patient,),
+        "evaluation": folder / "evaluation",
+        "replay": (folder / "anatomy", rollout),
+        "stage_seconds": {"atlas": 1.5, "training": 20.25},
+        "manifest": manifest(config={"patients": 1}, seed=7),
+    }
 
 
-def write_page(tmp_path, content) -> Page:
-    write_report(tmp_path / "report.html", content)
+def write_page(tmp_path, **content) -> Page:
+    write_report(tmp_path / "report.html", **content)
     return Page((tmp_path / "report.html").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
 def page(material, rollout, tmp_path_factory) -> Page:
-    return write_page(tmp_path_factory.mktemp("page"), make_content(material, rollout))
+    return write_page(tmp_path_factory.mktemp("page"), **make_content(material, rollout))
 
 
 def test_every_section_is_there(page):
@@ -116,20 +115,19 @@ def test_words_of_the_page(page, words):
 
 def test_sections_with_nothing_to_show_are_left_out(material, tmp_path):
     patient = PatientContent(name="mesh", anatomy=material / "anatomy")
-    page = write_page(tmp_path, ReportContent(title="T", origin="O", command="C", patients=(patient,)))
+    page = write_page(tmp_path, title="T", origin="O", command="C", patients=(patient,))
     assert page.sections == ["result", "patients", "navigation-in-space", "repeat"]
     assert "Nothing was evaluated" in page.words
 
 
 def test_one_known_patient_alone_is_reported(material, results, tmp_path):
     write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, {"c"}, 0))
-    content = ReportContent(title="T", origin="O", command="C", evaluation=tmp_path / "e")
-    page = write_page(tmp_path, content)
+    page = write_page(tmp_path, title="T", origin="O", command="C", evaluation=tmp_path / "e")
     assert "Of new navigations, known patients; the first 15 s" in page.words
 
 
 def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path):
-    content = dataclasses.replace(make_content(material, rollout), evaluation=tmp_path / "nowhere")
+    content = make_content(material, rollout) | {"evaluation": tmp_path / "nowhere"}
     with pytest.raises(InputError, match=r"metrics\.json"):
-        write_report(tmp_path / "report.html", content)
+        write_report(tmp_path / "report.html", **content)
     assert list(tmp_path.iterdir()) == []

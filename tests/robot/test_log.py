@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.robot.log import RobotLog, read_log
+from endopilot.robot.log import read_log
 from endopilot.xray.camera import PlanarCamera
 
 LOG = """time_s,episode,translation_mm,rotation_rad,encoder_mm,encoder_rad,tip_column_px,tip_row_px,flag
@@ -56,10 +56,7 @@ def test_velocities_are_summed_up_to_where_a_command_ends(tmp_path) -> None:
     )
     log = read_log(written(tmp_path, text, camera=False))
     np.testing.assert_allclose(log.command[:, 0], [[1, 0.5], [-1, 0.5], [-1, 0.5], [1, 0], [1, 0]])
-    log.write(tmp_path / "again.csv")
-    again = read_log(tmp_path / "again.csv")
-    np.testing.assert_allclose(again.command, log.command)
-    assert again.by_velocity
+    assert log.by_velocity
     assert log.camera is None and log.seen.tolist() == [False, True, False, False, False]
 
 
@@ -69,19 +66,6 @@ def test_a_table_of_a_spreadsheet_is_read(tmp_path) -> None:
         warnings.simplefilter("ignore")
         log = read_log(path)
     assert np.array_equal(log.command, read_log(written(tmp_path, LOG)).command, equal_nan=True)
-
-
-def test_a_log_is_written_as_it_is_read(tmp_path) -> None:
-    log = read_log(written(tmp_path, LOG))
-    pair = dataclasses.replace(log, **{name: np.repeat(getattr(log, name), 2, axis=1) for name in
-                                       ("command", "encoders", "load")})  # fmt: skip
-    for given in (log, pair, dataclasses.replace(log, camera=None, tip=log.pixel[:, [0, 1, 1]])):
-        given.write(tmp_path / "again.csv")
-        again = read_log(tmp_path / "again.csv")
-        for name in ("time_s", "episode", "command", "encoders", "load", "used"):
-            assert np.array_equal(getattr(again, name), getattr(given, name), equal_nan=True), name
-        assert np.array_equal(again.seen, given.seen)
-        assert isinstance(again, RobotLog) and (again.camera is None) == (given.camera is None)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from benchmarks.robot.synthetic import drawn, logged
+from benchmarks.robot.synthetic import PERIOD_S, drawn, logged
 from endopilot.cli import main
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
@@ -18,7 +18,14 @@ from endopilot.files import read_json
 @pytest.fixture(scope="module")
 def log_file(fork, wire, tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "log.csv"
-    logged(fork, wire, drawn(5), episodes=5, seconds=6.0, seed=5).write(path)
+    log = logged(fork, wire, drawn(5), episodes=5, seconds=6.0, seed=5)
+    columns = {"time_s": log.time_s, "episode": log.episode}
+    names = ("encoder_mm", "encoder_rad", "tip_x_mm", "tip_y_mm", "tip_z_mm")
+    columns |= dict(zip(names, [*log.encoders[:, 0].T, *log.tip.T], strict=True))
+    table, place = pd.DataFrame(columns), pd.DataFrame(log.command[::2, 0]).groupby(log.episode[::2])
+    for k, name in enumerate(("translation_mm_s", "rotation_rad_s")):  # a command stands in every other row
+        table.loc[::2, name] = (place[k].diff().fillna(place[k].transform("first")) / PERIOD_S).to_numpy()
+    table.to_csv(path, index=False)
     return path
 
 

@@ -54,14 +54,17 @@ COMMANDS = {
 }
 """Name of each command: what it takes -> what it makes."""
 _TOGETHER = {
-    "stages": "demo run",
-    "patients": "anatomy atlas phantom",
+    "patients": "segment anatomy atlas phantom",
     "data": "dataset dataset-info train evaluate",
-    "navigation": "plan navigate",
+    "navigation": "difficulty plan",
+    "xray": "xray angiograms",
     "robots": "replay calibrate",
     "checks": "verify devices",
+    "info": "sample completion info",
 }
-"""Modules of several commands that import about the same; all others have a module of their own name."""
+"""Modules of several commands that import about the same; others have a module of their own name, or are `_STAGES`."""
+_STAGES = {"demo": "study:run_demo", "run": "study:run_volume", "navigate": "navigation:navigate_into"}
+"""Commands that are functions of `endopilot.pipeline`: module and name."""
 GROUPS = {"demo": "All stages", "segment": "Patients", "simulate": "Simulation, data, models"}
 GROUPS |= {
     "difficulty": "Navigation",
@@ -103,11 +106,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def command_of(name: str) -> Command:
     """Return a command by its name."""
-    from endopilot.cli.options import Command  # tyro and pydantic are slow to import
+    from endopilot.cli.options import Command  # pydantic is slow to import
 
     module = next((module for module, names in _TOGETHER.items() if name in names.split()), name)
-    functions = vars(importlib.import_module(f"endopilot.cli.{module}"))
-    return Command(f"endopilot {name}", functions[f"{name.replace('-', '_')}_command"])
+    place, _, function = _STAGES.get(name, f"{module}:{name.replace('-', '_')}_command").partition(":")
+    room = "pipeline" if name in _STAGES else "cli"
+    return Command(f"endopilot {name}", getattr(importlib.import_module(f"endopilot.{room}.{place}"), function))
 
 
 def overview() -> str:

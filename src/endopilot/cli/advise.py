@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from endopilot.belief.advise import FIGURES_FILE, PICTURE_FILE, advise
 from endopilot.belief.monitoring import AdviseConfig
-from endopilot.cli.arguments import Answer, Existing, OutputFolder
+from endopilot.cli.arguments import Answer
+from endopilot.runs import Existing, OutputFolder
 
 
 def advise_command(
-    run: Positional[Path],
-    dataset: Positional[Existing],
+    run: Path,
+    dataset: Existing,
     /,
     *,
     output: OutputFolder,

@@ -6,38 +6,18 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
-from tyro.conf import arg
 
 from endopilot.cli.process import one_line
-from endopilot.errors import InputError
-from endopilot.files import json_text, regular
+from endopilot.files import json_text
 from endopilot.settings import Text, Within, settings
 
 EXIT_FAILED = 1
 Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
-
-
-def existing(path: Path) -> Path:
-    """Return `path` if a file or a folder is there; InputError if not, or if it may not be looked at."""
-    try:
-        path.stat()
-    except OSError as error:
-        raise InputError(f"{path}: {(error.strerror or str(error)).lower()}; check the path") from error
-    return regular(path)
-
-
-def _named(path: Path, what: str, suffix: str) -> Path:
-    if path.suffix.lower() != suffix:
-        raise InputError(f"{path}: a {what} is written as {suffix[1:].upper()}; name it with {suffix}")
-    return path
 
 
 @settings
@@ -49,15 +29,6 @@ class ListenConfig:
     machine."""
     port: Annotated[int, Within(0, 65535)] = 0
     """TCP port; 0 for a free one."""
-
-
-MUST_EXIST = "must exist"
-Existing = Annotated[Path, MUST_EXIST]  # a file or folder that must be there when the command begins
-IS_FOLDER, IS_FILE = "folder that is written", "file that is written"
-Picture = Annotated[Path, AfterValidator(partial(_named, what="picture", suffix=".png")), IS_FILE]
-Page = Annotated[Path, AfterValidator(partial(_named, what="page", suffix=".html")), IS_FILE]
-OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR"), IS_FOLDER]
-OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE"), IS_FILE]
 
 
 @dataclass(frozen=True)
@@ -81,45 +52,35 @@ def show_answer(answer: Answer | Figures | None, *, as_json: bool) -> None:
         return
     full = answer if isinstance(answer, Answer) else Answer(answer)
     for part in [full.figures] if as_json or full.shown is None else full.shown:
-        if isinstance(part, str):
-            print(part)
-        elif isinstance(part, Mapping):
-            show(part, as_json=as_json)
-        else:
-            show_rows(part, as_json=as_json)
+        show(part, as_json=as_json)
     if not full.passed:
         sys.exit(EXIT_FAILED)
 
 
-def show(figures: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print named figures as JSON or as aligned lines."""
-    if as_json:
-        print(_json(figures))
-        return
-    width = max((len(name) for name in figures), default=0)
-    for name, value in figures.items():
-        sentences = isinstance(value, list) and any(" " in str(item) for item in value)
-        lines = [str(item) for item in value] if sentences else [_text(value)]
-        for title, line in zip([name, *[""] * len(lines)], lines, strict=False):
-            print(f"{title:<{width}}  {one_line(line)}")
+def show(part: Figures | str, *, as_json: bool = False) -> None:
+    """Print a line of text; or named figures as aligned lines and rows of the same keys as a table, or both as JSON."""
+    if isinstance(part, str):
+        print(part)
+    elif as_json:
+        print(json_text(json.loads(json_text(part), parse_constant=lambda _: None)))
+    elif isinstance(part, Mapping):
+        width = max((len(name) for name in part), default=0)
+        for name, value in part.items():
+            sentences = isinstance(value, list) and any(" " in str(item) for item in value)
+            lines = [str(item) for item in value] if sentences else [_text(value)]
+            for title, line in zip([name, *[""] * len(lines)], lines, strict=False):
+                print(f"{title:<{width}}  {one_line(line)}")
+    else:
+        _show_rows(part)
 
 
-def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
-    """Print rows of the same keys as JSON or as a table."""
-    if as_json:
-        print(_json(list(rows)))
-        return
+def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     named = [escape(name.replace("_", "\n")) for name in (rows[0] if rows else ())]  # a line a word: narrow columns
     columns = (Column(name, overflow="fold", no_wrap=name == named[0]) for name in named)
     table = Table(*columns, box=None, padding=(0, 1, 0, 0))
     for row in rows:
         table.add_row(*(escape(_text(value)) for value in row.values()))
     Console(width=None if Console().is_terminal else 80).print(table)
-
-
-def _json(content: Any) -> str:
-    plain = json.loads(json_text(content), parse_constant=lambda _: None)
-    return json_text(plain)
 
 
 def _text(value: Any) -> str:

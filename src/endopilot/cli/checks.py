@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from tyro.conf import Positional
-
 from endopilot.cli.arguments import Answer
 from endopilot.devices.catheter import catheter_yaml, list_catheters
 from endopilot.devices.device import read_wire
@@ -28,9 +26,7 @@ def verify_command() -> Answer:
     return Answer(rows, [rows, more], passed=all(row["passed"] is not False for row in rows))
 
 
-def devices_command(
-    devices: Positional[tuple[str, ...]] = (), /, *, tip_load: bool = False, yaml: bool = False
-) -> Answer | None:
+def devices_command(devices: tuple[str, ...] = (), /, *, tip_load: bool = False, yaml: bool = False) -> Answer | None:
     """List devices: diameter, bending stiffness EI and torsional stiffness GJ at tip and shaft, tip load, tip shape.
 
     A device is shipped, or a YAML file in ~/.config/endopilot/devices or in the folder that ENDOPILOT_DEVICES names; it

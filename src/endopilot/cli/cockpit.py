@@ -6,17 +6,16 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
-
-from endopilot.cli.arguments import IS_FILE, Existing, ListenConfig
+from endopilot.cli.arguments import ListenConfig
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
+from endopilot.runs import Existing, Place
 from endopilot.settings import CountOrZero, Within
 
 
 def cockpit_command(
-    patient: Positional[Existing | None] = None,
+    patient: Existing | None = None,
     /,
     *,
     device: str = "workhorse-014",
@@ -26,7 +25,7 @@ def cockpit_command(
     world: CountOrZero = 0,
     replay: Existing | None = None,
     episode: Path | None = None,
-    film: Annotated[Path, IS_FILE] | None = None,
+    film: Annotated[Path, Place("file")] | None = None,
     resume: Existing | None = None,
     ct: Existing | None = None,
     igtl: Annotated[int, Within(0, 65535)] | None = None,
@@ -57,15 +56,18 @@ def cockpit_command(
         browser: open the page in a browser; --no-browser only prints its address.
         listen: the page's address; whoever is given it, token included, can then drive.
     """
-    if episode is not None:
-        _write_episode(replay, episode)
-        return
-    if film is not None:
-        from endopilot.cockpit.film import open_film
-        from endopilot.cockpit.slicer import write_film
+    for name, written in (("episode", episode), ("film", film)):
+        if written is not None and replay is None:
+            raise InputError(f"{name}: nothing is replayed; give --replay too")
+    if replay is not None and episode is not None:
+        from endopilot.cockpit.recording import write_session_episode
 
-        if replay is None:
-            raise InputError("film: nothing is replayed; give --replay too")
+        write_session_episode(replay, output=episode)
+        print(f"episode    {episode}")
+        return
+    if replay is not None and film is not None:
+        from endopilot.cockpit.film import open_film, write_film
+
         write_film(open_film(replay, patient, world=world, task=task), film)
         print(f"film       {film}")
         return
@@ -103,12 +105,3 @@ def cockpit_command(
             webbrowser.open(address)
 
     serve(stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)
-
-
-def _write_episode(session: Path | None, output: Path) -> None:
-    from endopilot.cockpit.recording import write_session_episode
-
-    if session is None:
-        raise InputError("episode: names no session; give --replay SESSION too")
-    write_session_episode(session, output=output)
-    print(f"episode    {output}")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from endopilot import __version__
-from endopilot.cli.arguments import Answer, Existing, Figures, OutputFolder
+from endopilot.cli.arguments import Answer, Figures
 from endopilot.dataset.config import DatasetConfig
 from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
@@ -16,12 +14,12 @@ from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE, REPORT_FI
 from endopilot.files import read_json
 from endopilot.models.config import TrainConfig
 from endopilot.report.report_text import mean_errors
-from endopilot.runs import claim
+from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.simulation.world import NOMINAL, read_world
 
 
 def dataset_command(
-    anatomies: Positional[tuple[Existing, ...]],
+    anatomies: tuple[Existing, ...],
     /,
     *,
     output: OutputFolder,
@@ -59,7 +57,7 @@ def dataset_command(
     return {"dataset": output, "episodes": info["total_episodes"], "samples": info["total_frames"]}
 
 
-def dataset_info_command(dataset: Positional[Existing], /, *, output: OutputFolder | None = None) -> Figures:
+def dataset_info_command(dataset: Existing, /, *, output: OutputFolder | None = None) -> Figures:
     """Describe a dataset: distributions of depth, offset and force, branches, failures with their reasons.
 
     Args:
@@ -76,7 +74,7 @@ def dataset_info_command(dataset: Positional[Existing], /, *, output: OutputFold
 
 
 def train_command(
-    dataset: Positional[tuple[Existing, ...]], /, *, output: OutputFolder, config: TrainConfig = TrainConfig()
+    dataset: tuple[Existing, ...], /, *, output: OutputFolder, config: TrainConfig = TrainConfig()
 ) -> Answer:
     """Train the paper's forward and inverse network on a dataset.
 
@@ -98,7 +96,7 @@ def train_command(
 
 
 def evaluate_command(
-    run: Positional[Path],
+    run: Path,
     /,
     *,
     output: OutputFolder,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
-import sys
 import time
 from pathlib import Path
 
@@ -41,5 +39,3 @@ def drive_command(
     low, high = travel_mm
     drive = Drive(limits, now=time.monotonic(), config=read_robot(robot), inserted_length=min(max(low, 0.0), high))
     asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
-    print("endopilot drive: terminated", file=sys.stderr)
-    sys.exit(128 + signal.SIGTERM)

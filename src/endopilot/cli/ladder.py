@@ -6,10 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from endopilot.cli.arguments import Answer, Existing, OutputFolder
+from endopilot.cli.arguments import Answer
 from endopilot.errors import InputError
 from endopilot.extras import extras_present, require_extras
 from endopilot.ladder.ladder import MISMATCH_FILE, LadderConfig, climb, measure_mismatch
+from endopilot.runs import Existing, OutputFolder
 
 
 def ladder_command(
@@ -67,9 +68,9 @@ def ladder_command(
 def _page(folder: Path) -> dict[str, Any]:
     if not extras_present()["report"]:
         return {"left_out": "the page, which needs: pip install 'endopilot[report]'"}
-    from endopilot.report.ladder_page import write_page
+    from endopilot.report.ladder_page import write_ladder_page
 
-    return {"page": write_page(folder)}
+    return {"page": write_ladder_page(folder)}
 
 
 def _tabulated(folder: Path | None) -> Answer:

@@ -8,13 +8,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tyro.conf import Positional
-
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Existing, Figures, OutputFile, Page, Picture
+from endopilot.cli.arguments import Figures
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
+from endopilot.runs import Existing, OutputFile, Page, Picture
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
@@ -22,8 +21,8 @@ from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 
 def locate_command(
-    anatomy: Positional[Existing],
-    seen: Positional[tuple[Existing, ...]],
+    anatomy: Existing,
+    seen: tuple[Existing, ...],
     /,
     *,
     camera: tuple[Existing, ...] = (),

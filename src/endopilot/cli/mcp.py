@@ -16,15 +16,15 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import Field
 from typing_extensions import TypedDict
-from tyro.conf import Positional
 
 from endopilot import __version__
-from endopilot.cli.arguments import Answer, Existing
+from endopilot.cli.arguments import Answer
 from endopilot.cli.options import Option
 from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 from endopilot.imaging.segment import METHODS
 from endopilot.navigation.policies import POLICIES
+from endopilot.runs import Existing
 
 _ABOUT = (
     "Vessels from CT angiograms, and guidewires simulated in them. Paths are relative to one folder. Units are mm, N, "
@@ -67,7 +67,7 @@ TOOLS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 figures are rows."""
 
 
-def mcp_command(folder: Positional[Existing], /) -> None:
+def mcp_command(folder: Existing, /) -> None:
     """Serve ten tools to an assistant on standard input and output, until it closes them. For research.
 
     Args:
@@ -114,7 +114,7 @@ def _tool(folder: Path, name: str) -> Callable[..., Any]:
         inspect.Parameter(
             each.name,
             inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if each.required or each.positional else each.value,
+            default=inspect.Parameter.empty if each.required else each.value,
             annotation=Annotated[_plain(each.kind), Field(description=each.meaning)],
         )
         for each in options.values()

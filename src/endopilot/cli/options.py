@@ -1,7 +1,8 @@
 """A command's options: its flags, its settings file and its help, all from the signature of its function.
 
 The options are the function's parameters and the fields of its `config`; a parameter that is a settings class is a
-group. A value stands on the command line, else in the file that `--config` names, else it is the default.
+group, one that is positional alone has no flag. A value stands on the command line, else in the file that `--config`
+names, else it is the default.
 """
 
 from __future__ import annotations
@@ -9,27 +10,24 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
-import io
 import itertools
 import json
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType, NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import docstring_parser
-import tyro
-from tyro.conf import Positional
 
-from endopilot.cli.arguments import IS_FILE, IS_FOLDER, MUST_EXIST, existing, show_answer
+from endopilot.cli.arguments import show_answer
 from endopilot.errors import InputError
 from endopilot.files import regular
-from endopilot.runs import check_new, check_outside
+from endopilot.runs import Place, check_new, check_outside, existing
 from endopilot.settings import Within, is_settings, read_settings, settings
 
 LISTED_AT_MOST = 10
@@ -69,8 +67,9 @@ _USUAL = {
     "volume": "DICOM folder or file, NIfTI, NRRD or MHA, in HU.",
 }
 """What options of several commands mean where a command says nothing else."""
+Note = TypeVar("Note")
 _WORDS = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
-_POSITIONAL = get_args(Positional[Any])[1]
+_NEGATIVE = re.compile(r"-\.?\d")
 
 
 @dataclass(frozen=True)
@@ -82,25 +81,26 @@ class Option:
     value: Any
     meaning: str
     required: bool = False
+    positional: bool = False
     group: tuple[Option, ...] = ()
 
     @property
-    def positional(self) -> bool:
-        """Whether it is given by its place, without a flag."""
-        return _POSITIONAL in _notes(self.kind)
-
-    @property
     def flags(self) -> list[str]:
-        """How it is called: `-o` and `--output`; in capitals if it is given by its place."""
+        """How it is called: `-o` and `--output`; in capitals if it is given by its place, without a flag."""
         if self.positional:
-            return [f"[{self.name.upper()} ...]" if _takes(self.kind).endswith("...]") else self.name.upper()]
-        short = [one for note in _notes(self.kind) for one in getattr(note, "aliases", None) or ()]
+            return [f"[{self.name.upper()} ...]" if self.variadic else self.name.upper()]
+        short = ["-o"] if self.name == "output" else []
         return [*short, f"--{'no-' if self.value is True else ''}{self.name.replace('_', '-')}"]
 
     @property
     def takes(self) -> str:
         """What follows the flag, such as `FLOAT FLOAT`; nothing after a switch."""
         return "" if self.positional else _takes(self.kind)
+
+    @property
+    def variadic(self) -> bool:
+        """Whether it takes any number of values."""
+        return _takes(self.kind).endswith("...]")
 
     @property
     def default(self) -> str:
@@ -110,7 +110,7 @@ class Option:
     @property
     def range(self) -> str:
         """What numbers it takes, in words; empty if it takes any, or no number."""
-        limits = next((note for note in _notes(self.kind) if isinstance(note, Within)), Within())
+        limits = next(iter(_notes(self.kind, Within)), Within())
         words = limits.mend(whole=False).removeprefix("give a ").removeprefix("number ")
         return "" if limits == Within() else words
 
@@ -131,10 +131,11 @@ class Command:
         hints = get_type_hints(function, include_extras=True)
         config = self._parameters.pop("config").default if "config" in self._parameters else None
         self._config, self._answers = type(config), hints.pop("return") is not NoneType
-        self._required = [one.name for one in self._parameters.values() if one.default is one.empty]
-        own = {one.name: (hints[one.name], one.default) for one in self._parameters.values()}
-        own |= {one: (own[one][0] | None, None) for one in self._required}
-        if any(IS_FILE in _notes(kind) for kind, _ in own.values()):
+        own = {
+            one.name: (hints[one.name] | None, None) if one.default is one.empty else (hints[one.name], one.default)
+            for one in self._parameters.values()
+        }
+        if any(place.of == "file" for kind, _ in own.values() for place in _notes(kind, Place)):
             own |= {"overwrite": (bool, False)}
         own |= {"json": (bool, False)} if self._answers else {}
         self._own = tuple(own)
@@ -152,8 +153,12 @@ class Command:
         """Return its options, set to `values` or the defaults: its function's in order, then its settings'."""
         meanings = _USUAL | _meanings(self._config)
         meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
-        found = _options(self.defaults if values is None else values, meanings, self._required)
-        tree = {one.name: one for one in found}
+        tree = {one.name: one for one in _options(self.defaults if values is None else values, meanings)}
+        for name, one in self._parameters.items():
+            option, positional = tree[name], one.kind is one.POSITIONAL_ONLY
+            if one.default is one.empty:
+                option = replace(option, kind=get_args(option.kind)[0], required=option.value is None)
+            tree[name] = replace(option, positional=positional)
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
     def run(self, arguments: Sequence[str]) -> None:
@@ -183,43 +188,52 @@ class Command:
 
     def _called(self, values: Any) -> Any:
         """Return what the function returns, once its inputs are there and nothing lies in the way of its outputs."""
-        paths: dict[str, list[Path]] = {MUST_EXIST: [], IS_FOLDER: [], IS_FILE: []}
+        places: list[tuple[Place, Path]] = []
         for one in itertools.chain.from_iterable(option.leaves() for option in self.options(values)):
             for path in one.value if isinstance(one.value, tuple) else (one.value,):
                 if isinstance(path, str | Path):
                     regular(path)
-                    for note in (note for note in _notes(one.kind) if isinstance(note, str) and note in paths):
-                        paths[note].append(Path(path))
-        inputs = [existing(path) for path in paths[MUST_EXIST]]
-        for folder in paths[IS_FOLDER]:
-            check_outside(folder, inputs)
-        for file in paths[IS_FILE]:
-            check_new(file, inputs, overwrite=values.overwrite)
+                    places += [(place, Path(path)) for place in _notes(one.kind, Place)]
+        inputs = [existing(path) for place, path in places if place.of == "input"]
+        for place, path in places:
+            if place.of == "folder":
+                check_outside(path, inputs)
+            for file in place.files(path):
+                check_new(file, inputs, overwrite=values.overwrite)
         given = {name: getattr(values, name) for name in self._parameters}
-        places = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
+        positional = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
         if self._config is not NoneType:
             given["config"] = self._config(**{one.name: getattr(values, one.name) for one in fields(self._config)})
-        return self._function(*places, **given)
+        return self._function(*positional, **given)
 
     def read(self, arguments: Sequence[str]) -> Any:
         """Return what the arguments set the options to, an instance of `settings`; InputError as `run`."""
-        rest = [word for word in arguments if word != "--print-config"]
-        file = _taken(rest, "--config")
+        given = self._given(arguments)
+        file, incomplete = given.pop("--config", None), given.pop("--print-config", False)
         start = self.defaults if file is None else read_settings(Path(file), self.settings, onto=self.defaults)
-        leaves = [leaf for option in self.options(start) for leaf in option.leaves()]
-        parts = [_part(leaf, incomplete=len(rest) < len(arguments)) for leaf in leaves]
-        said = io.StringIO()
-        try:
-            with contextlib.redirect_stderr(said):
-                shape = make_dataclass("Arguments", parts, kw_only=True)
-                given = tyro.cli(shape, prog=self.name, args=rest, add_help=False)
-        except SystemExit:
-            line = _first_line(said.getvalue())
-            if found := re.match(r"Error parsing (.+?): .*\b(int|float)\b.*: ('.*')$", line):
-                kind = "whole number" if found[2] == "int" else "number"
-                raise InputError(f"{found[1]}: {found[3]}; give a {kind}") from None
-            raise InputError(f"{line}; `{self.name} --help` lists the options") from None
+        missing = [one for one in self.options(start) if one.required and one.name not in given]
+        if missing and not incomplete:
+            called = ", ".join(f"{flag} {missing[0].takes}".rstrip() for flag in missing[0].flags)
+            _Parser(self.name).error(f"Missing from {self.name}: {called}")
         return _with(start, given)
+
+    def _given(self, arguments: Sequence[str]) -> dict[str, Any]:
+        """Return what the arguments set, by name: what means nothing is text, which the settings refuse."""
+        parser = _Parser(self.name, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+        parser.add_argument("--config", dest="--config")
+        parser.add_argument("--print-config", dest="--print-config", action="store_true")
+        leaves = {leaf.name: leaf for one in self.options() for leaf in one.leaves()}
+        for one in leaves.values():
+            if one.positional:
+                parser.add_argument(one.name, nargs="*" if one.variadic else "?")
+            elif one.kind is bool:
+                parser.add_argument(f"--{one.name.replace('_', '-')}", action=argparse.BooleanOptionalAction)
+            else:
+                count = "*" if one.variadic else len(one.takes.split())
+                parser.add_argument(*one.flags, dest=one.name, nargs=count)
+        words = [f" {word}" if _NEGATIVE.match(word) else word for word in arguments]  # no flag to argparse
+        given = vars(parser.parse_intermixed_args(words))
+        return given | {name: _meant(leaves[name].kind, of) for name, of in given.items() if name in leaves}
 
     def help(self, *, everything: bool) -> str:
         """Return the text of `--help`, or of `--help-all` with `everything`."""
@@ -261,17 +275,18 @@ class Command:
         return "\n".join([head, *_yaml(self.options(values), ""), ""])
 
 
-def _options(values: Any, meanings: Mapping[str, str], required: Collection[str]) -> Iterator[Option]:
+class _Parser(argparse.ArgumentParser):
+    """What splits a command line into options, and refuses as we do."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; `{self.prog} --help` lists the options")
+
+
+def _options(values: Any, meanings: Mapping[str, str]) -> Iterator[Option]:
     kinds = get_type_hints(type(values), include_extras=True)
     for name, value in _contents(values).items():
-        kind, meaning = kinds[name], meanings.get(name, "")
-        if is_settings(type(value)):
-            group = tuple(_options(value, _meanings(type(value)), ()))
-            yield Option(name, kind, value, meaning, group=group)
-        elif name in required:
-            yield Option(name, get_args(kind)[0], value, meaning, required=value is None)
-        else:
-            yield Option(name, kind, value, meaning)
+        group = tuple(_options(value, _meanings(type(value)))) if is_settings(type(value)) else ()
+        yield Option(name, kinds[name], value, meanings.get(name, ""), group=group)
 
 
 @cache
@@ -285,56 +300,47 @@ def _contents(values: Any) -> dict[str, Any]:
     return {one.name: getattr(values, one.name) for one in fields(values)}
 
 
-def _with(values: Any, given: Any) -> Any:
+def _with(values: Any, given: Mapping[str, Any]) -> Any:
     new = {
-        name: _with(old, given) if is_settings(type(old)) else getattr(given, name)
+        name: _with(old, given) if is_settings(type(old)) else given.get(name, old)
         for name, old in _contents(values).items()
     }
     return type(values)(**new)
 
 
-def _part(one: Option, *, incomplete: bool) -> tuple[str, Any, Any]:
-    """Return a field of the class that tyro parses; with `incomplete`, nothing need be given."""
-    if one.positional:
-        notes = [_POSITIONAL, tyro.conf.arg(metavar=one.flags[0])]
-    else:
-        notes = [note for note in _notes(one.kind) if getattr(note, "aliases", None)]
-    kind = one.kind | None if one.required and incomplete else one.kind
-    default = MISSING if one.required and not incomplete else one.value
-    return one.name, Annotated[kind, *notes] if notes else kind, field(default=default)
+def _meant(kind: Any, words: Any) -> Any:
+    """Return what a word of a command line, or words, mean for a kind; what is no number stays text."""
+    inner, origin = get_args(kind), get_origin(kind)
+    if kind is bool:
+        return words
+    if origin in (Annotated, Union, UnionType):
+        return None if words == ["None"] and NoneType in inner else _meant(inner[0], words)
+    if origin is tuple:
+        size = len(_takes(inner[0]).split())
+        parts = [words[k : k + size] for k in range(0, len(words), size)]
+        kinds = inner[:1] * len(parts) if ... in inner else inner
+        return tuple(_meant(one, part) for one, part in zip(kinds, parts, strict=False))
+    word = words if isinstance(words, str) else words[0]
+    word = word[1:] if word.startswith(" ") and _NEGATIVE.match(word[1:]) else word
+    if origin is Literal:
+        return next((one for one in inner if str(one) == word), word)
+    with contextlib.suppress(ValueError):
+        return kind(word) if kind in (int, float) else word
+    return word
 
 
-def _taken(words: list[str], flag: str) -> str | None:
-    """Take a flag and its value out of words, and return the value; None if the flag is not there."""
-    for i, word in enumerate(words):
-        name, sign, value = word.partition("=")
-        if name == flag:
-            del words[i]
-            if not sign and i == len(words):
-                raise InputError(f"{flag}: names no file; give one")
-            return value if sign else words.pop(i)
-    return None
-
-
-def _first_line(box: str) -> str:
-    """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
-    lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
-    lines = itertools.dropwhile(lambda line: not line.strip(" ─-"), lines)  # dashes where the terminal has no lines
-    first = list(itertools.takewhile(lambda line: line.strip(" ─-"), lines))
-    return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))
-
-
-def _notes(kind: Any) -> list[Any]:
+def _notes(kind: Any, of: type[Note]) -> list[Note]:
+    """Return the notes of a class in the annotations of a kind, and of those within it."""
     inner = get_args(kind)
-    own, kinds = (inner[1:], inner[:1]) if get_origin(kind) is Annotated else ((), inner)
-    return [*own, *(note for one in kinds for note in _notes(one))]
+    return [one for one in inner if isinstance(one, of)] + [note for one in inner for note in _notes(one, of)]
 
 
 def _takes(kind: Any) -> str:
     """Return in capitals what a value of some kind is written as on the command line."""
     inner = get_args(kind)
     if get_origin(kind) is Annotated:
-        return next((note.metavar for note in inner[1:] if getattr(note, "metavar", None)), _takes(inner[0]))
+        written = [one for one in inner[1:] if isinstance(one, Place) and one.of != "input"]
+        return {"folder": "DIR", "file": "FILE"}[written[0].of] if written else _takes(inner[0])
     if get_origin(kind) is Literal:
         return f"{{{','.join(map(str, inner))}}}"
     if get_origin(kind) is tuple:

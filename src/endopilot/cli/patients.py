@@ -1,31 +1,72 @@
-"""`endopilot anatomy`, `atlas` and `phantom`: masks, anatomies and synthetic patients."""
+"""`endopilot segment`, `anatomy`, `atlas` and `phantom`: masks, anatomies and synthetic patients."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
-
-from tyro.conf import Positional
 
 from endopilot import __version__
 from endopilot.anatomy.batch import claim_anatomy, extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
-from endopilot.cli.arguments import Existing, Figures, OutputFile, OutputFolder, Picture, existing
+from endopilot.cli.arguments import Figures
 from endopilot.errors import InputError
-from endopilot.imaging.grid import check_covers
-from endopilot.imaging.volume import check_output, read_volume, write_volume
+from endopilot.files import input_hash, manifest
+from endopilot.imaging.grid import check_covers, compare_masks
+from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.imaging.volume import check_output, read_mask, read_volume, write_mask, write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
-from endopilot.runs import check_outside, claiming
+from endopilot.runs import Existing, OutputFile, OutputFolder, Picture, check_outside, claiming, existing
 from endopilot.settings import Seed
 from endopilot.types import Anatomy
 from endopilot.vessels.read_source import read_source
 
 
+def segment_command(
+    volume: Existing,
+    /,
+    *,
+    output: OutputFile,
+    series: str | None = None,
+    phase: str | None = None,
+    reference: Existing | None = None,
+    picture: Picture | None = None,
+    config: SegmentConfig = SegmentConfig(),
+) -> Figures:
+    """Segment the lumen of a vessel tree in a CT angiogram.
+
+    A JSON file beside the mask holds the ostium, the method, the manifest, and warnings of what is doubtful.
+
+    Args:
+        output: mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
+        reference: another mask of the same vessel; the agreement is printed, and its outline is red in the picture.
+        picture: PNG of three slices with the mask's outline in green.
+    """
+    check_output(output, mask=True)
+    other = read_mask(reference) if reference is not None else None
+    ct = read_volume(volume, series=series, phase=phase)
+    mask = segment(ct, config=config)
+    agreement = compare_masks(mask, other) if other is not None else None
+    write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume, ct.files)))
+    volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
+    ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
+    figures = {"mask": output, "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
+    figures["warnings"] = list(mask.warnings)
+    if agreement is not None:
+        figures |= {name: round(value, 4) for name, value in asdict(agreement).items()}
+    if picture is not None:
+        from endopilot.imaging.overlay_picture import draw_overlay  # matplotlib is slow to import
+
+        draw_overlay(ct, mask, picture, reference=other)
+        figures["picture"] = picture
+    return figures
+
+
 def anatomy_command(
-    sources: Positional[tuple[Path, ...]],
+    sources: tuple[Path, ...],
     /,
     *,
     output: OutputFolder,
@@ -133,7 +174,7 @@ def atlas_command(*, output: OutputFolder, config: AtlasConfig = AtlasConfig()) 
 
 
 def phantom_command(
-    anatomy: Positional[Existing], /, *, output: OutputFile, seed: Seed = 0, config: PhantomConfig = PhantomConfig()
+    anatomy: Existing, /, *, output: OutputFile, seed: Seed = 0, config: PhantomConfig = PhantomConfig()
 ) -> Figures:
     """Make a synthetic CT angiogram of an anatomy.
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
-from tyro.conf import Positional
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Answer, Existing, Figures, OutputFile, OutputFolder
+from endopilot.cli.arguments import Answer, Figures
 from endopilot.devices.catheter import write_device
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
@@ -21,11 +21,11 @@ from endopilot.plotting import png
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
 from endopilot.robot.log import read_log
 from endopilot.robot.replay import EpisodeReplay, ReplayConfig, replay_log, summary
-from endopilot.runs import check_new, claim
+from endopilot.runs import Existing, OutputFolder, Place, claim
 
 
 def replay_command(
-    log: Positional[Existing],
+    log: Existing,
     /,
     *,
     anatomy: Existing,
@@ -46,7 +46,7 @@ def replay_command(
             manifest.json.
         robot: name of a robot or a YAML file, such as `endopilot calibrate` writes.
     """
-    from endopilot.report.replay_figure import replay_figure  # matplotlib is slow to import
+    from endopilot.report.figures import replay_figure  # matplotlib is slow to import
 
     patient, read = read_anatomy(anatomy), read_log(log, topics=topics)
     wire, drives = read_wire(device), read_robot(robot)
@@ -76,19 +76,18 @@ def _table(episode: EpisodeReplay) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-_BY = "endopilot calibrate"
+_BY, _WIRE = "endopilot calibrate", ".device.yaml"
 
 
 def calibrate_command(
-    logs: Positional[tuple[Existing, ...]],
+    logs: tuple[Existing, ...],
     /,
     *,
     anatomy: Existing,
-    output: OutputFile,
+    output: Annotated[Path, Place("file", beside=(_WIRE, ".json"))],
     device: str = "workhorse-014",
     robot: str = "assumed",
     topics: tuple[str, ...] = (),
-    overwrite: bool = False,
     config: CalibrateConfig = CalibrateConfig(),
 ) -> Answer:
     """Find gain, lag, plays, tip shape, friction and stiffness of a robot and its wire, each with an interval.
@@ -104,8 +103,6 @@ def calibrate_command(
         device: name of a device (`endopilot devices`) or a YAML file, as the wire is known.
         robot: name of a robot or a YAML file, as the robot is known.
     """
-    for path in (_beside(output), output.with_suffix(".json")):
-        check_new(path, (*logs, anatomy), overwrite=overwrite)
     read, patient = [read_log(path, topics=topics) for path in logs], read_anatomy(anatomy)
     found = calibrate(read, patient, read_wire(device), robot=read_robot(robot), config=config)
     names = ", ".join(log.name for log in read)
@@ -135,7 +132,7 @@ def calibrate_command(
     record = {"estimates": intervals} | about | figures
     write_json(output.with_suffix(".json"), manifest(config=config, seed=config.seed, inputs=inputs) | record)
     estimated = {name: str(each) for name, each in found.estimates.items()}
-    files = {"robot": output, "wire": _beside(output)}
+    files = {"robot": output, "wire": output.with_suffix(_WIRE)}
     read_out = any(np.isfinite(log.encoders).any() for log in read)
     encoders = {"encoders_at": found.robot.encoders_at if read_out else "not identifiable from this log"}
     return Answer(record | files, shown=[estimated | encoders | about | figures | files])
@@ -156,8 +153,4 @@ def _write(found: RobotCalibration, output: Path, names: str) -> None:
         for field, by in of_wire.items()
         if all(name in by_name for name in by)
     }
-    write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), output=_beside(output))
-
-
-def _beside(output: Path) -> Path:
-    return output.with_suffix(".device.yaml")
+    write_device(replace(found.wire, sources=dict(found.wire.sources) | texts), output=output.with_suffix(_WIRE))

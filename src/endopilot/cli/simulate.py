@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Existing, Figures, OutputFile, Picture
+from endopilot.cli.arguments import Figures
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
 from endopilot.progress import progress
+from endopilot.runs import Existing, Picture, Place
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
@@ -43,10 +43,10 @@ class RandomConfig:
 
 
 def simulate_command(
-    anatomy: Positional[Existing],
+    anatomy: Existing,
     /,
     *,
-    output: OutputFile,
+    output: Annotated[Path, Place("file", (".parquet", ".csv", ".npz"))],
     device: str | None = None,
     catheter: tuple[str, ...] = (),
     controls: Existing | None = None,

@@ -1,20 +1,22 @@
-"""`endopilot xray`: anatomy -> X-ray image of a wire in it, alone or in a catheter."""
+"""`endopilot xray` and `angiograms`: X-ray images of devices in vessels."""
 
 from __future__ import annotations
 
-from tyro.conf import Positional
-
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import Existing, Figures, OutputFile
+from endopilot.angiograms.config import AngiogramsConfig
+from endopilot.cli.arguments import Figures
+from endopilot.devices.stack import Stack
+from endopilot.files import read_json
 from endopilot.imaging.volume import read_volume
+from endopilot.runs import Existing, OutputFolder, Picture
 from endopilot.xray.take_image import TakeImageConfig, take_image
 
 
 def xray_command(
-    anatomy: Positional[Existing],
+    anatomy: Existing,
     /,
     *,
-    output: OutputFile,
+    output: Picture,
     ct: Existing | None = None,
     config: TakeImageConfig = TakeImageConfig(),
 ) -> Figures:
@@ -32,3 +34,33 @@ def xray_command(
     if volume is not None and volume.notes:
         figures["ct_notes"] = list(volume.notes)
     return figures | {"frames": image.frames, "air_kerma_ugy": round(image.air_kerma_ugy, 3)}
+
+
+def angiograms_command(
+    patients: tuple[Existing, ...],
+    /,
+    *,
+    output: OutputFolder,
+    device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
+    scheduler: str | None = None,
+    config: AngiogramsConfig = AngiogramsConfig(),
+) -> Figures:
+    """Make X-ray cines of patients' vessels, with contrast, motion and devices, and the truth of each frame.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        patients: folders made by `endopilot anatomy` or `endopilot atlas`, or CT angiograms, which are segmented.
+        output: folder of the data set.
+    """
+    from endopilot.angiograms.config import MANIFEST_FILE, SAMPLES_FILE  # slow to import; --help needs none
+    from endopilot.angiograms.make import make_angiograms
+
+    make_angiograms(patients, output=output, device=Stack.of(device, *catheter), config=config, scheduler=scheduler)
+    splits = read_json(output / MANIFEST_FILE)["splits"]
+    return {
+        "data_set": output,
+        **{f"{split}_{what}": count for split, counts in splits.items() for what, count in counts.items()},
+        "samples": output / SAMPLES_FILE,
+    }

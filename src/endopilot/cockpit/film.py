@@ -4,6 +4,7 @@ trajectory, episode or navigation while the page shows its begin."""
 from __future__ import annotations
 
 import threading
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,15 +22,27 @@ from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
-from endopilot.files import reading
+from endopilot.files import reading, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
+from endopilot.progress import progress
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import TRAJECTORY, SimulationSetUp, Trajectory, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import Task
 
 FRAME_S = 0.05  # time from one frame of a film to the next, s
+EVERY = 4
+"""Frames of a film, of 0.05 s, from one in the file to the next."""
+_ONE = """<Model id="vtkMRMLModelNode{0}" name="Wire" references="storage:vtkMRMLModelStorageNode{0};"></Model>
+<ModelStorage id="vtkMRMLModelStorageNode{0}" fileName="Data/Wire_{0}.vtp" coordinateSystem="LPS"></ModelStorage>"""
+_ALL = """<?xml version="1.0" encoding="UTF-8"?>
+<MRML version="Slicer 5.0.0 30822" userTags="">
+{models}
+<Sequence id="vtkMRMLSequenceNodeSequenceIndex" name="Sequence" singletonTag="SequenceIndex" indexName="time"
+ indexUnit="s" indexType="numeric" numericIndexValueTolerance="0.001" indexValues="{times}"></Sequence>
+</MRML>
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,24 +186,69 @@ def _film(
             anatomy, stack, actuation=set_up.actuation, motion=set_up.motion, config=replace(set_up.config, threads=1)
         )
         simulator.reset(inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction)
-        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * start.size}
-        yield FilmFrame(take_snapshot(simulator, None, **frame), 0 in exposed)
-        force_n = 0.0
-        for number, command in enumerate(np.repeat(commands, parts, axis=0), start=1):
-            before = simulator.proximal[0]
-            step = simulator.step([command], period_s / parts)
-            force_n = max(force_n, float(step.contact_force_max[0]))
+        force_n, before = 0.0, simulator.proximal[0]
+        for number, command in enumerate([None, *np.repeat(commands, parts, axis=0)]):
+            if command is not None:
+                before = simulator.proximal[0]
+                step = simulator.step([command], period_s / parts)
+                force_n = max(force_n, float(step.contact_force_max[0]))
             if number % every == 0:
-                frame = {
-                    "cycle": number // every,
-                    "time_s": number * period_s / parts,
-                    "force_n": force_n,
-                    "velocity": tuple(((simulator.proximal[0] - before) * parts / period_s).ravel().tolist()),
-                }
-                yield FilmFrame(take_snapshot(simulator, step, **frame), number // every in exposed)
+                moved = (simulator.proximal[0] - before) * parts / period_s
+                shown = take_snapshot(
+                    simulator,
+                    cycle=number // every,
+                    time_s=number * period_s / parts,
+                    force_n=force_n,
+                    velocity=tuple(moved.ravel().tolist()),
+                )
+                yield FilmFrame(shown, number // every in exposed)
                 force_n = 0.0
 
     return Film(navigation, len(commands) * period_s, title, make)
+
+
+def write_film(film: Film, output: Path) -> None:
+    """Write wire and catheters of a film as lines, LPS mm, with the wall's force on each node, N: at its end (.vtp, a
+    model), or every 0.2 s (.seq.mrb, a sequence). Raises InputError for another suffix, or a film that fails."""
+    whole = output.name.endswith(".seq.mrb")
+    if not whole and output.suffix != ".vtp":
+        raise InputError(
+            f"{output}: no file of 3D Slicer; name it .seq.mrb for the motion, .vtp for the path at its end"
+        )
+    with progress("Driving again", 1) as advance:
+        shown = [frame.snapshot for frame in film.make()]
+        advance()
+    with writing(output) as partial:
+        if not whole:
+            partial.write_text(_as_vtp(shown[-1]), encoding="utf-8")
+            return
+        chosen = shown[::EVERY]
+        times = ";".join(f"vtkMRMLModelNode{number}:{each.time_s:g}" for number, each in enumerate(chosen))
+        models = "\n".join(map(_ONE.format, range(len(chosen))))
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("Wire/Wire.mrml", _ALL.format(models=models, times=times))
+            for number, each in enumerate(chosen):
+                archive.writestr(f"Wire/Data/Wire_{number}.vtp", _as_vtp(each))
+
+
+def _as_vtp(shown: Snapshot) -> str:
+    """Return the devices at a moment as the text of a VTP file: a line each, with `Force` of each point."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    from endopilot.vessels.surface import polydata_of  # VTK is slow to import
+
+    devices = (shown, *shown.catheters)
+    offsets = np.cumsum([0, *(len(each.nodes) for each in devices)])
+    polydata = polydata_of(np.concatenate([each.nodes for each in devices]), offsets, np.arange(offsets[-1]), "Lines")
+    force = numpy_to_vtk(np.concatenate([each.node_force for each in devices]).astype(float), deep=True)
+    force.SetName("Force")
+    polydata.GetPointData().AddArray(force)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(polydata)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return writer.GetOutputString()
 
 
 class ReplayStage:
@@ -228,15 +286,13 @@ class ReplayStage:
         """Show the next frame."""
         if not self.film.frames:
             return []
-        sent: list[tuple[str, bytes]] = []
         self.at = min(self.at, len(self.film.frames) - 1)
         frame = self.film.frames[self.at]
-        images = self._xray.pulse(frame.snapshot)
+        sent = self._xray.pulse(frame.snapshot)
         if self._xray.ready:
-            if images is None and frame.exposed and self._shown != self.at:
-                images = self._xray.expose(frame.snapshot)
+            if not sent and frame.exposed and self._shown != self.at:
+                sent = self._xray.expose(frame.snapshot)
             self._shown = self.at
-            sent = [(f"image{number}", image) for number, image in enumerate(images or [])]
         sent.append(("state", encode("state", self._values(), **device_arrays(frame.snapshot))))
         if self.playing and self.at + 1 < len(self.film.frames):
             self.at += 1

@@ -93,8 +93,8 @@ class XrayUnit:
         share = min(since / _FILL_S, 1.0) if since < CONTRAST_S else float(np.exp(-(since - CONTRAST_S) / _WASH_S))
         return share if share > _GONE else 0.0
 
-    def pulse(self, snapshot: Snapshot) -> list[bytes] | None:
-        """Return the images of a pulse if one is due, as messages for the page, else None."""
+    def pulse(self, snapshot: Snapshot) -> list[tuple[str, bytes]]:
+        """Return the images of a pulse if one is due, a channel's name and a message each, else none."""
         if self._surroundings is not None:  # with the first cycle, so that the page is there before
             self._around, self._surroundings = self._pool.submit(self._surroundings), None
         if self._around is not None and self._around.done():
@@ -103,13 +103,13 @@ class XrayUnit:
         period = 1 / self.settings.frames_per_s
         self._next_s = min(self._next_s, snapshot.time_s + period)  # a replay may go back in time
         if not (self.pedal and self.ready and snapshot.time_s >= self._next_s - 1e-9):
-            return None
+            return []
         behind = snapshot.time_s - self._next_s
         self._next_s = self._next_s + period if behind < period else snapshot.time_s + period
         return self.expose(snapshot, seconds=period)
 
-    def expose(self, snapshot: Snapshot, *, seconds: float = 0.0) -> list[bytes]:
-        """Expose once, which counts for some seconds of fluoroscopy, and return the images as messages for the page."""
+    def expose(self, snapshot: Snapshot, *, seconds: float = 0.0) -> list[tuple[str, bytes]]:
+        """Expose once, which counts for some seconds of fluoroscopy, and return the images as `pulse` does."""
         self.frames, self.seconds, self._image_s = self.frames + 1, self.seconds + seconds, snapshot.time_s
         share = self.contrast(snapshot.time_s)
         messages = []
@@ -131,7 +131,7 @@ class XrayUnit:
             roadmap = self._roadmap.get(key) if self.settings.roadmap and share == 0 else None
             image = self.imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}
-            messages.append(encode("image", header, grey=image))
+            messages.append((f"image{number}", encode("image", header, grey=image)))
         return messages
 
     def values(self, now_s: float) -> dict[str, Any]:

@@ -83,10 +83,8 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
     ends = [round(float(catheter.tip.abscissa[0]), 2) for catheter in snapshot.catheters]
     return ({"catheter_tips_mm": ends} if ends else {}) | {
         "tip_mm": round(float(snapshot.tip.abscissa[0]), 2),
-        "offset_mm": round(float(snapshot.tip.offset[0]), 3),
         "section": anatomy.tree.section_names[int(labels[nearest])],
         "force_n": round(snapshot.force_n, 4),
-        "wall_force_n": round(snapshot.wall_force_n, 4),
     }
 
 
@@ -113,9 +111,7 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
         "diameter_mm": device.diameter_mm,
         "force_limit_n": navigation.force_limit_n,
         "push_limit_n": device.push_limit_n,
-        "fastest": [device.max_velocity_mm_s, device.max_rotation_rad_s],
         "lines": lines,
-        "parents": [branch.parent for branch in anatomy.tree.branches],
         "sections": [{"label": label, "name": names[label]} for label in present],
         "ostium": anatomy.insertion.position.round(3).tolist(),
         "guiding_catheter": {

@@ -58,7 +58,7 @@ class GameSession(Session):
         tried: Attempt,
         world: LiveWorld,
         xray: XrayUnit,
-        recorder: Recorder | None = None,
+        recorder: Recorder,
         policies: tuple[str, ...] = (),
     ) -> None:
         """Take the world at the task's start, and the policies that a page may choose at the end."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.messages import Message
 from endopilot.cockpit.session import Stage
-from endopilot.errors import InputError
+from endopilot.robot.drive import listen
 
 FRAME_S = 0.04
 """Time between what is sent, s: 25 a second."""
@@ -30,10 +30,7 @@ class Streamed:
         """Listen on a TCP port; `scene` returns the message of what does not move. InputError if the port is taken."""
         self._stage, self._scene, self._next_s = stage, scene, -np.inf
         self._peers: list[socket.socket] = []
-        try:
-            self._listener = socket.create_server(("127.0.0.1", port))
-        except OSError as error:
-            raise InputError(f"igtl: {port}: {error.strerror}; choose another port") from error
+        self._listener = listen("127.0.0.1", port, named="igtl")
         self._listener.setblocking(False)
 
     @property

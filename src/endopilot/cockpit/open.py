@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,8 +116,8 @@ def _driven(
     make: Callable[..., Session] = Session,
 ) -> Opened:
     navigation = world.navigation
-    name = f"{where.task or navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    recorder = Recorder(path or _free(output, name), world, where, seed)
+    name = f"{where.task or navigation.anatomy.name}-{datetime.now():%Y%m%d-%H%M%S-%f}{SUFFIX}"
+    recorder = Recorder(path or output / name, world, where, seed)
     policies = POLICIES.names()
     session = make(world, xray_unit(navigation, read_ct(ct)), recorder, policies)
     return Opened(session, scene_of(navigation, {"policies": policies}), world.config.cycle_s, recorder.path)
@@ -166,10 +166,3 @@ def _synthetic(output: Path) -> Path:
 
         write_anatomy(reference_navigation().anatomy, output=folder)
     return folder
-
-
-def _free(output: Path, name: str) -> Path:
-    number, path = 1, output / f"{name}{SUFFIX}"
-    while path.exists():
-        number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"
-    return path

@@ -193,12 +193,10 @@ def _lines(path: Path) -> list[dict[str, Any]]:
         raise InputError(f"{path}: cannot be read ({error}); give a session of the cockpit") from error
     lines = []
     for line in text.splitlines(keepends=True):
-        if not line.endswith("\n"):
-            break  # half-written
         try:
-            content = json.loads(line)
+            content = json.loads(line) if line.endswith("\n") else None  # half-written
         except (json.JSONDecodeError, RecursionError):
-            break
+            content = None
         if not isinstance(content, dict):
             break
         lines.append(content)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
-import errno
 import hashlib
 import hmac
 import ipaddress
 import re
 import secrets
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import monotonic
-from urllib.parse import urlsplit
+from time import monotonic, perf_counter
 
 import uvicorn
 from starlette.applications import Starlette
@@ -28,15 +28,18 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from endopilot.cockpit.frames import encode
-from endopilot.cockpit.messages import LONGEST_MESSAGE, Ping, Wheel, read_message
-from endopilot.cockpit.session import Loop, Stage
+from endopilot.cockpit.messages import LONGEST_MESSAGE, Message, Ping, Wheel, read_message
+from endopilot.cockpit.session import Stage
 from endopilot.errors import InputError
+from endopilot.robot.drive import listen
 
 WEB = Path(__file__).parent / "web"
 MOST_PAGES = 8  # pages that may look at once
 MOST_PER_SECOND = 200  # messages that a page may send in a second
 MOST_FAULTS = 20  # messages of a page that may be refused before its connection is closed
 REFUSED, BUSY = 4403, 4429  # why a WebSocket is closed: wrong token or origin; too many pages, messages, faults
+_LATE_S = 0.25  # a cycle that is later than this lets the time go, s
+_IDLE_S = 0.05  # time from one look for pages to the next, while nobody looks, s
 
 
 @dataclass(eq=False)
@@ -61,12 +64,12 @@ class Cockpit:
     ) -> None:
         """Lay out the routes; a page's address must hold the token, and one of `hosts` or the connection's own."""
         self._token, self._hosts, self._scene = token, hosts, scene
-        self.loop = Loop(stage, cycle_s, self._publish)
+        self._stage, self._cycle_s = stage, cycle_s
+        self._inbox: list[Message | str] = []
         self._pages: list[_Page] = []
         self._driver: _Page | None = None
         self._counted = 0
         self._kept: dict[str, bytes] = {}
-        self._async: asyncio.AbstractEventLoop | None = None
         self._index = (WEB / "index.html").read_text(encoding="utf-8")
         self.app = Starlette(
             routes=[
@@ -80,17 +83,52 @@ class Cockpit:
 
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        self._async = asyncio.get_running_loop()
-        self.loop.start()
+        running = asyncio.create_task(self._run())
         try:
             yield
         finally:
-            await asyncio.to_thread(self.loop.stop)
+            running.cancel()
+            await asyncio.wait([running])
 
-    def _publish(self, channel: str, message: bytes) -> None:
-        """Give a message to all pages; called from the loop's thread."""
-        if self._async is not None and not self._async.is_closed():
-            self._async.call_soon_threadsafe(self._spread, channel, message)
+    async def _run(self) -> None:
+        """Let the stage's cycles pass one after the other, in a thread of their own, and the time go that a cycle took
+        too long."""
+        due = perf_counter()
+        try:
+            with ThreadPoolExecutor(1, "cockpit") as thread:
+                while True:
+                    inbox, self._inbox = self._inbox, []
+                    run = asyncio.get_running_loop().run_in_executor(thread, self._cycle, inbox)
+                    passed, sent = await run
+                    for channel, message in sent:
+                        self._spread(channel, message)
+                    done = perf_counter()
+                    due += self._cycle_s
+                    if not passed or done - due > _LATE_S:
+                        due = done + (0.0 if passed else _IDLE_S)
+                    await asyncio.sleep(max(due - done, 0.0))
+        except Exception as error:
+            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            self._spread("error", encode("error", {"text": f"The simulation has stopped. {text}", "fatal": True}))
+            told = (type(error), error, error.__traceback__, threading.current_thread())
+            threading.excepthook(threading.ExceptHookArgs(told))  # which the command line tells, too
+        finally:
+            self._stage.close()
+
+    def _cycle(self, inbox: list[Message | str]) -> tuple[bool, list[tuple[str, bytes]]]:
+        """Give the stage what the driver sent, or why the wire must stop, and let a cycle pass if somebody looks;
+        return whether it did, and what the pages are to get."""
+        now, notices = perf_counter(), list[tuple[str, bytes]]()
+        for message in inbox:
+            try:
+                if isinstance(message, str):
+                    self._stage.halt(message)
+                else:
+                    self._stage.handle(message, now)
+            except InputError as error:
+                notices.append(("notice", encode("notice", {"text": str(error)})))
+        passes = bool(self._pages) or getattr(self._stage, "watched", bool)()
+        return passes, notices + (self._stage.cycle(now) if passes else [])
 
     def _spread(self, channel: str, message: bytes) -> None:
         if channel.startswith("image") or channel in ("state", "error", "result"):
@@ -103,8 +141,9 @@ class Cockpit:
         connection came in at, as another name may be a foreign page's (DNS rebinding); the origin the page itself."""
         host, origin = connection.headers.get("host", ""), connection.headers.get("origin")
         address, port = connection.scope.get("server") or ("", None)
-        name, asked_port = _host_and_port(host)
-        if asked_port != port or not (name in self._hosts or _same_address(name, address)):
+        own = address.partition("%")[0].removeprefix("::ffff:")  # one of IPv4 may come in through a socket of IPv6
+        named = {*self._hosts, f"[{own}]" if ":" in own else own}
+        if host.lower() not in {f"{name}:{port}" for name in named} | (named if port == 80 else set()):
             return False
         if (need_origin or origin is not None) and origin != f"http://{host}":
             return False
@@ -138,7 +177,6 @@ class Cockpit:
         if self._driver is None:
             self._driver = page
         self._tell_roles()
-        self.loop.pause(False)
         sender = asyncio.create_task(self._send(socket, page))
         try:
             await self._receive(socket, page)
@@ -147,10 +185,8 @@ class Cockpit:
             self._pages.remove(page)
             if self._driver is page:
                 self._driver = None
-                self.loop.halt("connection")
+                self._inbox.append("connection")
             self._tell_roles()
-            if not self._pages:
-                self.loop.pause(True)
 
     async def _send(self, socket: WebSocket, page: _Page) -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
@@ -191,7 +227,7 @@ class Cockpit:
         elif isinstance(message, Wheel):
             return self._wheel(page, message.take)
         elif page is self._driver:
-            self.loop.send(message)
+            self._inbox.append(message)
         else:
             return "this page only watches; take the wheel first"
         return None
@@ -203,7 +239,7 @@ class Cockpit:
             self._driver = page
         elif page is self._driver:
             self._driver = None
-            self.loop.halt("wheel")
+            self._inbox.append("wheel")
         self._tell_roles()
         return None
 
@@ -211,26 +247,6 @@ class Cockpit:
         for page in self._pages:
             header = {"drives": page is self._driver, "taken": self._driver is not None, "pages": len(self._pages)}
             page.put("role", encode("role", header))
-
-
-def _host_and_port(host: str) -> tuple[str, int | None]:
-    """Return name and port of a `Host` header; 80 where it states none, and None where it is no such header."""
-    try:
-        parts = urlsplit(f"//{host}")
-        if parts.netloc != host or parts.username is not None:
-            return "", None
-        return parts.hostname or "", 80 if parts.port is None else parts.port
-    except ValueError:
-        return "", None
-
-
-def _same_address(name: str, address: str) -> bool:
-    """Return whether a name is an IP address, and which one; one of IPv4 may come in through a socket of IPv6."""
-    try:
-        asked, came_in = ipaddress.ip_address(name), ipaddress.ip_address(address.partition("%")[0])
-    except ValueError:
-        return False
-    return asked in (came_in, getattr(came_in, "ipv4_mapped", None))
 
 
 def _headers(index: str) -> dict[str, str]:
@@ -266,7 +282,7 @@ def serve(
     """Serve a stage until Ctrl-C; `listening` is called with the page's address, token included. InputError if `host`
     (0.0.0.0 or :: for all addresses of this machine) and `port` (0 for a free one) cannot be listened on."""
     token = secrets.token_urlsafe(_TOKEN_BYTES)
-    with _listener(host, port) as listener:
+    with listen(host, port) as listener:
         address, number = listener.getsockname()[:2]
         everywhere = ipaddress.ip_address(address).is_unspecified
         names = {"localhost", host.lower()} | (machine_names() if everywhere else set())
@@ -284,7 +300,6 @@ def serve(
             limit_concurrency=MOST_CONNECTIONS,
             server_header=False,
         )
-        listener.listen()
         shown = ("127.0.0.1" if listener.family == socket.AF_INET else "::1") if everywhere else host
         listening(f"http://{f'[{shown}]' if ':' in shown else shown}:{number}/?token={token}")
         uvicorn.Server(config).run(sockets=[listener])
@@ -294,25 +309,3 @@ def machine_names() -> set[str]:
     """Return the names that this machine has for others, in lower case."""
     name = socket.gethostname().lower()
     return {name, name.partition(".")[0], socket.getfqdn().lower()}
-
-
-def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to an address; InputError if there is none here, or the port cannot be had."""
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = found[0]
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"host: {host!r} is no address; give one of this machine's, such as 127.0.0.1") from error
-    # The protocol is named so that asyncio sends each message at once: it asks for that (TCP_NODELAY) only then.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # :: takes IPv4, too
-        listener.bind(address)
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRNOTAVAIL:
-            raise InputError(f"host: {host!r} is no address of this machine; give one that is") from error
-        raise InputError(f"port: {port} on {host}: {error.strerror}; choose another") from error
-    return listener

@@ -1,12 +1,9 @@
-"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out. All of it runs
-in one thread, `Loop`, by the world's clock; the only real time is the watchdog's."""
+"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out, all of it by
+the world's clock; the only real time is the watchdog's."""
 
 from __future__ import annotations
 
-import queue
-import threading
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any, Protocol, runtime_checkable
 
@@ -32,11 +29,10 @@ AUTOPILOT_SILENCE_S = 1.0  # the autopilot pauses after this time without a mess
 class Session:
     """One world driven from a page, and a policy that may drive; `sight`: may the page show the wire in space?"""
 
-    def __init__(
-        self, world: LiveWorld, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
-    ) -> None:
-        """Take the parts: nothing is kept without a recorder; `policies` are the names that a page may choose from."""
+    def __init__(self, world: LiveWorld, xray: XrayUnit, recorder: Recorder, policies: tuple[str, ...] = ()) -> None:
+        """Take the parts; `policies` are the names that a page may choose from."""
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
+        self._record = recorder.event
         self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
         self.sight = True
@@ -113,14 +109,12 @@ class Session:
         sent = self._think()
         if not self.autopilot.waits:
             self.world.advance()
-            if self._recorder is not None:
-                self._recorder.cycle()
+            self._recorder.cycle()
         snapshot = self.world.snapshot()
-        pulse = self.xray.pulse(snapshot)
-        if pulse is not None:
+        if pulse := self.xray.pulse(snapshot):
             self.world.loop.exposed()
-        sent += _images(self._counted(pulse))
-        return [*sent, ("state", self.state(snapshot))]
+            self._count()
+        return [*sent, *pulse, ("state", self.state(snapshot))]
 
     def state(self, snapshot: Snapshot) -> bytes:
         """Return the message that shows the world as it is."""
@@ -147,8 +141,7 @@ class Session:
         self.halt("closed")
         self.xray.close()
         self.autopilot.close()
-        if self._recorder is not None:
-            self._recorder.close()
+        self._recorder.close()
 
     def _hear(self, now_s: float) -> None:
         """Take a sign of life of who drives, the first one after a silence perhaps."""
@@ -221,40 +214,30 @@ class Session:
     def _think(self) -> list[tuple[str, bytes]]:
         if self.autopilot.status == "off" or (self.autopilot.drives and not self.xray.ready):
             return []
-        snapshot, images = self.world.snapshot(), []
+        snapshot, sent = self.world.snapshot(), list[tuple[str, bytes]]()
         before = self.autopilot.values()
-        taken = self.autopilot.think(lambda: images.extend(self._counted(self.xray.expose(snapshot))))
+
+        def expose() -> None:
+            sent.extend(self.xray.expose(snapshot))
+            self._count()
+
+        taken = self.autopilot.think(expose)
         if taken is not None:
             self._note(taken, taken)
-        sent = _images(images)
         if self.sight and self.autopilot.values() != before:
             belief = self.autopilot.belief(snapshot)
             sent += [] if belief is None else [("belief", belief)]
         return sent
 
-    def _counted(self, images: list[bytes] | None) -> list[bytes]:
-        """Write an exposure into the recording, if there was one, and return its images."""
-        if images is None:
-            return []
+    def _count(self) -> None:
+        """Write an exposure into the recording."""
         xray = self.xray
         self._record(exposure=xray.frames, seconds=xray.seconds, kerma_ugy=xray.kerma_ugy)
-        return images
-
-    def _record(self, **what: Any) -> None:
-        if self._recorder is not None:
-            self._recorder.event(**what)
-
-
-def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
-    return [(f"image{number}", image) for number, image in enumerate(images)]
-
-
-_LATE_S = 0.25  # a loop that is later than this lets the time go, s
 
 
 @runtime_checkable
 class Stage(Protocol):
-    """What the loop runs: a session that is driven, or one that is replayed."""
+    """What the server runs: a session that is driven, or one that is replayed."""
 
     def handle(self, message: Message, now_s: float) -> None:
         """Do what a page asks for, at a real time, s."""
@@ -271,85 +254,3 @@ class Stage(Protocol):
     def close(self) -> None:
         """End it."""
         ...
-
-
-class Loop:
-    """Runs a stage in a thread of its own. What pages send goes through a queue; what they get, to `publish`.
-    `late_cycles` counts how often time was let go because a cycle took too long."""
-
-    def __init__(self, stage: Stage, cycle_s: float, publish: Callable[[str, bytes], None]) -> None:
-        """Take the stage; `publish` is called in the thread with a channel's name and a message."""
-        self._stage, self._cycle_s, self._publish = stage, cycle_s, publish
-        self._inbox: queue.SimpleQueue[Message | str] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="cockpit", daemon=True)
-        self._wanted, self._over = threading.Event(), threading.Event()
-        self.late_cycles = 0
-
-    def start(self) -> None:
-        """Start the thread; time passes while `run` is set."""
-        self._thread.start()
-
-    def pause(self, paused: bool) -> None:
-        """Let time stand still, as while nobody looks, or go on."""
-        if paused:
-            self._wanted.clear()
-        else:
-            self._wanted.set()
-
-    def send(self, message: Message) -> None:
-        """Give the stage a message of who drives."""
-        self._inbox.put(message)
-
-    def halt(self, why: str) -> None:
-        """Let the stage stop the wire in its next cycle."""
-        self._inbox.put(why)
-
-    def stop(self) -> None:
-        """End the thread and the stage."""
-        self._over.set()
-        self._wanted.set()
-        if self._thread.ident is not None:
-            self._thread.join(timeout=10)
-
-    def _run(self) -> None:
-        try:
-            self._cycles()
-        except Exception as error:
-            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            self._publish("error", encode("error", {"text": f"The simulation has stopped. {text}", "fatal": True}))
-            raise  # which the command line tells, too
-        finally:
-            self._stage.close()
-
-    def _cycles(self) -> None:
-        due = time.perf_counter()
-        while not self._over.is_set():
-            if not (self._wanted.is_set() or getattr(self._stage, "watched", bool)()):
-                self._read(time.perf_counter())
-                if not self._wanted.wait(timeout=0.05):
-                    continue
-                due = time.perf_counter()
-            now = time.perf_counter()
-            self._read(now)
-            for channel, message in self._stage.cycle(now):
-                self._publish(channel, message)
-            due += self._cycle_s
-            done = time.perf_counter()
-            if done - due > _LATE_S:
-                due, self.late_cycles = done, self.late_cycles + 1
-            if due > done:
-                time.sleep(due - done)
-
-    def _read(self, now: float) -> None:
-        while True:
-            try:
-                message = self._inbox.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                if isinstance(message, str):
-                    self._stage.halt(message)
-                else:
-                    self._stage.handle(message, now)
-            except InputError as error:
-                self._publish("notice", encode("notice", {"text": str(error)}))

@@ -16,7 +16,6 @@ from endopilot.lines import length_along
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Step
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
@@ -40,14 +39,13 @@ class ShownDevice:
 class Snapshot(ShownDevice):
     """The wire, the catheters around it from the inside out, and the world, at the end of a cycle. Of the wire and then
     of each catheter: the motor's velocity (mm/s, rad/s), the drive's push (N) and torque (N·mm), and the advance (mm)
-    and rotation (rad) that it slipped over. `force_n` is the largest wall force on one node during the cycle,
-    `wall_force_n` the largest resultant on 2 mm of the wire, N; `valid` is false once the simulation has failed."""
+    and rotation (rad) that it slipped over. `force_n` is the largest wall force on one node during the cycle, N;
+    `valid` is false once the simulation has failed."""
 
     cycle: int
     time_s: float
     velocity: tuple[float, ...]
     force_n: float
-    wall_force_n: float
     drive_load: tuple[float, ...]
     slip: tuple[float, ...]
     valid: bool
@@ -141,7 +139,6 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
     """Return how the world of a navigation is after a number of the drives' cycles; `force_n` as in `Snapshot`."""
     return take_snapshot(
         loop.simulator,
-        loop.robot.last_step,
         cycle=cycle,
         time_s=cycle * loop.config.cycle_s,
         force_n=force_n,
@@ -150,7 +147,7 @@ def loop_snapshot(loop: NavigationLoop, *, cycle: int, force_n: float) -> Snapsh
 
 
 def take_snapshot(
-    simulator: Simulator, step: Step | None, *, cycle: int, time_s: float, force_n: float, velocity: tuple[float, ...]
+    simulator: Simulator, *, cycle: int, time_s: float, force_n: float, velocity: tuple[float, ...]
 ) -> Snapshot:
     """Return how the one world of a simulator is now; `force_n` and `velocity` as in `Snapshot`."""
     inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
@@ -158,16 +155,14 @@ def take_snapshot(
         ShownDevice(*line, tip[:, k], float(inserted[k]), turned[k])
         for k, line in enumerate(_lines(simulator, inserted))
     )
-    slip = np.zeros((len(inserted), 2)) if step is None else simulator.slip[0]
     return Snapshot(
         **vars(wire),
         cycle=cycle,
         time_s=time_s,
         velocity=velocity,
         force_n=force_n,
-        wall_force_n=0.0 if step is None else float(step.wall_force[0]),
         drive_load=tuple(simulator.drive_load[0].ravel().tolist()),
-        slip=tuple(slip.ravel().tolist()),
+        slip=tuple(simulator.slip[0].ravel().tolist()),
         valid=bool(simulator.valid[0]),
         catheters=tuple(catheters),
     )

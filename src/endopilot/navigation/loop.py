@@ -147,7 +147,7 @@ class NavigationLoop:
             self.c_arm.known_motion = measured
         self._random = np.random.default_rng([seed, 2])
         self._track = Track()
-        self._track.moved(self.simulator, self.robot.proximal, float(self.simulator.contacts.max()))
+        self._moved(float(self.simulator.contacts.max()))
         self._periods = navigation.periods(DECISION_PERIOD_S)
         self._period, self._cycles_left, self._peak_n = 0, 0, 0.0
         self._driver: Policy | None = None
@@ -241,14 +241,15 @@ class NavigationLoop:
         # An image in which no wire was found is taken again.
         self._expose = bool(decision.expose) or (self._exposed and tip is None)
         self.gives_up = decision.gives_up
-        fault = taken[: len(decision.devices)] != decision.devices
-        self._track.decided(taken, seen, self.believed, exposed=self._exposed, fault=fault)
+        self._track.faults += taken[: len(decision.devices)] != decision.devices
+        self._track.decided.append((taken, seen, self.believed))
+        self._track.exposures.append(int(self._exposed))
         self._period, self._cycles_left, self._peak_n = self._period + 1, self.config.cycles, 0.0
         return Decision(taken, expose=self._expose, gives_up=self.gives_up)
 
     def exposed(self) -> None:
         """Count an exposure that was taken for whoever drives by hand."""
-        self._track.exposed()
+        self._track.exposures[-1] += 1
 
     def advance(self, seconds: float) -> float:
         """Let robot and wire move for a multiple of the drives' cycle, no farther than to the end of the period.
@@ -278,8 +279,12 @@ class NavigationLoop:
             self.navigation, self.world, self.simulator, self.robot, self.reason or "stopped", self.gives_up
         )
 
+    def _moved(self, peak_n: float) -> None:
+        simulator = self.simulator
+        self._track.moved.append((self.robot.proximal, simulator.tip_position[0], simulator.position[0], peak_n))
+
     def _end_period(self) -> None:
-        self._track.moved(self.simulator, self.robot.proximal, self._peak_n)
+        self._moved(self._peak_n)
         if not self.simulator.valid[0]:
             self.reason = "invalid"
         elif self.reached:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -126,40 +126,16 @@ def count_navigation_events(
     return {kind: count_events(state[:-1], record.exposed[:-1]) for kind, state in states.items()}
 
 
+@dataclass(eq=False)
 class Track:
-    """Gathers what happens in a navigation."""
+    """What happens in a navigation: proximal state, tips, nodes and largest wall force (N) at the end of each period;
+    what was decided, observed and believed at its begin; exposures before the first decision and in each period; and
+    how many decisions were mended."""
 
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        self._moved: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
-        self._decided: list[tuple[Proximals, Observation | None, BelievedTip | None]] = []
-        self._exposures: list[int] = []
-        self._faults, self._before = 0, 0
-
-    def decided(
-        self,
-        control: Proximals,
-        seen: Observation | None,
-        believed: BelievedTip | None,
-        *,
-        exposed: bool,
-        fault: bool,
-    ) -> None:
-        """Take what was decided, what was observed then, whether X-ray was on, and what the policy believed."""
-        self._decided.append((control, seen, believed))
-        self._exposures.append(exposed + self._before)
-        self._faults, self._before = self._faults + fault, 0
-
-    def exposed(self) -> None:
-        """Take an exposure within a period."""
-        if self._exposures:
-            self._exposures[-1] += 1
-        else:
-            self._before += 1
-
-    def moved(self, simulator: Simulator, proximal: Float[np.ndarray, "devices 2"], peak_n: float) -> None:
-        """Take where the devices are at the end of a period, and the largest wall force in it, N."""
-        self._moved.append((proximal, simulator.tip_position[0], simulator.position[0], peak_n))
+    moved: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = field(default_factory=list)
+    decided: list[tuple[Proximals, Observation | None, BelievedTip | None]] = field(default_factory=list)
+    exposures: list[int] = field(default_factory=lambda: [0])
+    faults: int = 0
 
     def record(
         self,
@@ -172,14 +148,14 @@ class Track:
     ) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period."""
         tree = simulator.set_up.anatomies[0].tree  # the radii at the tips are those of the true vessel
-        proximal, position, shape, force = map(np.array, zip(*self._moved, strict=True))
+        proximal, position, shape, force = map(np.array, zip(*self.moved, strict=True))
         samples, devices, _ = proximal.shape
         periods = samples - 1  # a decision whose period is not over does not count
         cycles = periods * round(DECISION_PERIOD_S / robot.recorder.period_s)
-        exposures = np.array([*self._exposures[:periods], 0])
-        control, seen, told = zip(*self._decided[:periods], strict=True) if periods else ((), (), ())
+        exposures = np.array([sum(self.exposures[:2]), *self.exposures[2 : periods + 1], 0] if periods else [0])
+        control, seen, told = zip(*self.decided[:periods], strict=True) if periods else ((), (), ())
         believed = [_NOTHING if tip is None else tip for tip in told] + [_NOTHING]
-        tells = any(tip is not None for *_, tip in self._decided)
+        tells = any(tip is not None for *_, tip in self.decided)
         found = believed[-2].found if periods else ""
         where = np.array([(tip.abscissa, tip.offset) for tip in believed])
         half_width, branch = np.array([tip.half_width for tip in believed]), np.array([tip.branch for tip in believed])
@@ -230,7 +206,7 @@ class Track:
             peak_force_n=float(force.max()),
             exposures=int(exposures.sum()),
             path_mm=float(np.linalg.norm(np.diff(position[:, 0], axis=0), axis=1).sum()),
-            faults=self._faults,
+            faults=self.faults,
             reason=reason,
             gives_up=gives_up,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from endopilot.control.set_up import tip_name
 from endopilot.devices.stack import Stack
 from endopilot.extras import extras_present
 from endopilot.files import manifest, read_json, write_json, writing
-from endopilot.runs import claim
+from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory import TRAJECTORY
 from endopilot.tasks.targets import section_at
@@ -31,18 +31,30 @@ EPISODE_FOLDER, ANATOMY_FOLDER, MANIFEST_FILE = "episode", "anatomy", "manifest.
 
 
 def navigate_into(
-    anatomy: str | Path,
-    target: str,
+    anatomy: Existing,
+    /,
     *,
-    output: str | Path,
+    target: str,
+    output: OutputFolder,
     policy: str = "agent",
     device: str = "workhorse-014",
-    catheter: Sequence[str] = (),
-    config: NavigateConfig | None = None,
+    catheter: tuple[str, ...] = (),
+    config: NavigateConfig = NavigateConfig(),
 ) -> dict[str, Any]:
-    """Drive a wire to a place in a patient's vessel, as `navigate` does, and write what happened into a folder, unless
-    the same was finished there. `target` is a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm. Returns the
-    outcome in one line, and figures. Raises InputError where it cannot begin, or the folder is another run's."""
+    """Let a policy drive a wire to a place of a patient's vessel: simulated robot, X-ray only when the policy asks.
+
+    The folder gets navigation.html (replay and course), navigation.csv, navigation.png, trajectory.npz for `endopilot
+    simulate`, episode for `endopilot train`, and manifest.json. Whether the target was reached, or why not,
+    is the first line that is printed; the exit code is 0 either way.
+
+    Args:
+        output: folder of the results.
+        policy: what decides: agent, cloned, oracle (which is given the truth), open-loop, forward, spin,
+            retract-rotate, with a catheter in-turn or catheter-alone, or MODULE:OBJECT of your own.
+
+    Raises:
+        InputError: The navigation cannot begin, or the folder is another run's.
+    """
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
     _claim(Path(output), set_up)

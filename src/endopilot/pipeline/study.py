@@ -4,7 +4,6 @@ run goes on, and end with report.html, metrics.json and manifest.json."""
 
 from __future__ import annotations
 
-import hashlib
 import re
 import sys
 import time
@@ -35,10 +34,9 @@ from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline.navigation import navigate_into
 from endopilot.progress import progress
-from endopilot.runs import claim
+from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.types import Volume
 from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
@@ -144,16 +142,21 @@ class _Run:
         """Whether networks are trained here, rather than simulated wires evaluated."""
         return self.config.training_seconds > 0
 
-    @property
-    def model(self) -> Path:
-        """What is evaluated: this study's networks, or simulated wires."""
-        return self.output / "training" if self.trains else Path(WIRES)
 
+def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = DemoConfig()) -> dict[str, Any]:
+    """Run every stage once on synthetic patients: CT angiogram, segmentation, anatomy, simulation, training, report.
 
-def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Run all stages on synthetic patients, from their CT volumes alone; write `output`/report.html, and return its
-    path and figures. Raises InputError where a stage's library is missing, the folder is another run's, or too few
-    patients could be segmented."""
+    An interrupted demo goes on where it stopped when the same command is given again.
+
+    Args:
+        output: folder of all results; the report is report.html.
+
+    Returns:
+        The report's path, and figures.
+
+    Raises:
+        InputError: A stage's library is missing, the folder is another run's, or too few patients were segmented.
+    """
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
@@ -184,25 +187,38 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
 
 
 def run_volume(
-    volume: Path,
-    output: Path,
-    config: RunConfig,
+    volume: Existing,
+    /,
     *,
+    output: OutputFolder,
+    target: str | None = None,
     series: str | None = None,
     phase: str | None = None,
-    target: str | None = None,
+    config: RunConfig = RunConfig(),
 ) -> dict[str, Any]:
-    """Run all stages on one CT angiogram in HU, as `run_demo`. With a target (a section such as "4" or "LAD", or a
-    point "X,Y,Z" in LPS mm; another one later), the agent drives the wire there, into `output`/navigation. Raises
-    InputError as `read_volume`, `segment` and `navigate`, and where the folder belongs to another run."""
+    """Run every stage on one patient, from the CT angiogram to the report.
+
+    With --target the agent drives the wire to a place of the vessel, as `endopilot navigate` does with its defaults;
+    the page of that navigation is in the folder `navigation`. Simulated wires are evaluated in this
+    patient; --training-seconds trains networks on it instead.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        output: folder of all results; the report is report.html.
+
+    Raises:
+        InputError: As `run_demo`, `read_volume`, `segment` and `navigate`.
+    """
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
-    identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
+    inputs = input_hash(volume, content.files)
+    identity = {"volume_sha256": inputs[volume.name], "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
     folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     stages.do("read", lambda: write_volume(content, copy))
-    notes, inputs = content.notes, input_hash(volume, content.files)
+    notes = content.notes
     for note in notes:
         print(note, file=sys.stderr)
     del content  # up to a gigabyte
@@ -222,14 +238,6 @@ def run_volume(
     anatomies = _anatomies(run, [copy])
     navigation = {} if target is None else _navigate(run, anatomies[0], target)
     return {name: navigation[name] for name in ("outcome", "page") if name in navigation} | _study(run, anatomies)
-
-
-def _digest(volume: Volume) -> str:
-    """Return the SHA-256 of voxels and geometry: of what the run uses, whatever file or series it came from."""
-    digest = hashlib.sha256()
-    for part in (volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction):
-        digest.update(f"{part.dtype} {part.shape} ".encode() + np.ascontiguousarray(part).tobytes())
-    return digest.hexdigest()
 
 
 def _number(path: Path) -> int:
@@ -279,7 +287,7 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
 def _navigate(run: _Run, anatomy: Path, target: str) -> dict[str, Any]:
     assert run.navigation is not None
     settings = NavigateConfig(seed=run.config.seed)
-    return navigate_into(anatomy, target, output=run.navigation, device=run.config.device, config=settings)
+    return navigate_into(anatomy, target=target, output=run.navigation, device=run.config.device, config=settings)
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
@@ -309,9 +317,11 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
         training = TrainConfig(max_seconds=config.training_seconds, seed=config.seed)
         run.stages.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
 
+    model = output / "training" if trains else Path(WIRES)
+
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(run.model, output=output / "evaluation", config=settings, dataset=output / "dataset")
+        evaluate(model, output=output / "evaluation", config=settings, dataset=output / "dataset")
         report_evaluation(output / "evaluation")
 
     run.stages.do("evaluation", measure)
@@ -320,11 +330,10 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
 
 
 def _report(run: _Run, anatomies: Sequence[Path]) -> None:
-    from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
+    from endopilot.report.report import PatientContent, write_report  # matplotlib and plotly
 
     output = run.output
-    anatomy, replay = _replay(output)
-    scores = _scores(anatomies)
+    replay, scores = _replay(output), _scores(anatomies)
     write_json(output / "scores.json", scores)
     patients = tuple(
         PatientContent(
@@ -336,19 +345,18 @@ def _report(run: _Run, anatomies: Sequence[Path]) -> None:
         )
         for folder in anatomies
     )
-    content = ReportContent(
+    write_report(
+        output / REPORT_FILE,
         title="endopilot: from a CT angiogram to guidewire control",
         origin=f"{run.origin} {UNKNOWN_WIRE}" if not run.trains else run.origin,
         command=run.command,
         patients=patients,
         evaluation=output / "evaluation",
         replay=replay,
-        replay_anatomy=anatomy,
         navigation=run.navigation,
         stage_seconds=run.stages.seconds,
         manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
     )
-    write_report(output / REPORT_FILE, content)
 
 
 def _scores(anatomies: Sequence[Path]) -> dict[str, dict[str, float]]:

@@ -1,5 +1,5 @@
-"""The figures of an evaluation and of a report, and the tables of what they draw, which are written beside them as CSV;
-`titles` says what a reader calls each split."""
+"""The figures of an evaluation, a report and a log's replay, and the tables of what an evaluation's draw, which are
+written beside them as CSV; `titles` says what a reader calls each split."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from jaxtyping import Shaped
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from endopilot.anatomy.projection import safety_ratio
@@ -18,6 +19,8 @@ from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles
 from endopilot.evaluation.results import CONTROL_BASELINES, SERIES_TITLES, TIP_BASELINES, SplitResult
 from endopilot.imaging.overlay_picture import draw_slices
 from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
+from endopilot.robot.kinematics import evenly
+from endopilot.robot.replay import EpisodeReplay
 from endopilot.types import Anatomy, LumenMask, Volume
 
 SERIES_STYLE: dict[str, dict] = {
@@ -34,6 +37,8 @@ SERIES_STYLE: dict[str, dict] = {
 }
 
 
+MOST_SHOWN = 4  # episodes of a replay that one picture shows, evenly chosen from all
+_SPARE_MM = 4.0
 SAFETY_SERIES = ("true", "P3", "P4")
 
 
@@ -76,22 +81,9 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
     return pd.concat(pieces, ignore_index=True)
 
 
-def rows(table: pd.DataFrame, **equal: str) -> pd.DataFrame:
-    """Return the rows in which each named column has the given value."""
-    chosen = np.ones(len(table), dtype=bool)
-    for column, value in equal.items():
-        chosen &= np.asarray(table[column]) == value
-    return pd.DataFrame(table[chosen])
-
-
-def values(table: pd.DataFrame, column: str) -> np.ndarray:
-    """Return a column of numbers."""
-    return np.asarray(table[column], dtype=float)
-
-
-def distinct(table: pd.DataFrame, column: str) -> list[str]:
-    """Return the different values of a column in the order of their appearance."""
-    return [str(value) for value in dict.fromkeys(table[column])]
+def _groups(table: pd.DataFrame, column: str) -> dict[str, pd.DataFrame]:
+    """Return the rows of each value of a column, in the order of their appearance."""
+    return {str(name): pd.DataFrame(part) for name, part in table.groupby(column, sort=False)}
 
 
 def _ordered(available: Mapping[str, Any], order: Sequence[str]) -> list[str]:
@@ -100,16 +92,14 @@ def _ordered(available: Mapping[str, Any], order: Sequence[str]) -> list[str]:
 
 def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
     """Draw the mean |error| of Δtip and γtip against time, one row a split (`tip_error_table`)."""
-    splits = distinct(table, "split")
+    splits = _groups(table, "split")
     panels = (("abscissa_mae_mm", "Mean |error| of Δtip, mm"), ("offset_mae_mm", "Mean |error| of γtip, mm"))
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), 2, height=3.0)
-        for row, split in enumerate(splits):
-            part = rows(table, split=split)
-            for ax, (column, label) in zip(axes[row], panels, strict=True):
-                for series in distinct(part, "series"):
-                    line = rows(part, series=series)
-                    ax.plot(values(line, "time_s"), values(line, column), **_style(series))
+        for row, (split, part) in zip(axes, splits.items(), strict=True):
+            for ax, (column, label) in zip(row, panels, strict=True):
+                for series, line in _groups(part, "series").items():
+                    ax.plot(line["time_s"], line[column], **_style(series))
                 ax.set(xlabel="Time after the given states, s", ylabel=label, xlim=(0, None))
                 ax.set_ylim(0, _upper(part, column))
                 ax.set_title(titles[split])
@@ -119,26 +109,24 @@ def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
 
 def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
     """Draw γ/(r − r_w), below it γ/r, against time, a column a split, with median, quartiles and 95 % quantile."""
-    splits = distinct(table, "split")
+    splits = _groups(table, "split")
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(ratios), len(splits), height=3.2)
-        for row, (ratio, label, wall) in enumerate(ratios):
-            of_ratio = rows(table, ratio=ratio)
-            for ax, split in zip(axes[row], splits, strict=True):
-                part = rows(of_ratio, split=split)
-                for series in distinct(part, "series"):
-                    line, style = rows(part, series=series), _style(series)
-                    time, quartiles = values(line, "time_s"), (values(line, "q25"), values(line, "q75"))
-                    ax.fill_between(time, *quartiles, color=style["color"], alpha=0.16, lw=0)
-                    ax.plot(time, values(line, "median"), **style)
-                    ax.plot(time, values(line, "p95"), color=style["color"], lw=0.8, ls="-")
+        for row, (ratio, label, wall) in zip(axes, ratios, strict=True):
+            highest = _upper(_groups(table, "ratio")[ratio], "p95")
+            for ax, (split, part) in zip(row, splits.items(), strict=True):
+                for series, line in _groups(_groups(part, "ratio")[ratio], "series").items():
+                    time, style = line["time_s"], _style(series)
+                    ax.fill_between(time, line["q25"], line["q75"], color=style["color"], alpha=0.16, lw=0)
+                    ax.plot(time, line["median"], **style)
+                    ax.plot(time, line["p95"], color=style["color"], lw=0.8, ls="-")
                 ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
                 at = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
                 ax.annotate(wall, (0.995, 1.0), size=8.5, bbox=plate, **at)
                 ax.set(xlabel="Time after the given states, s", ylabel=f"Safety ratio {label}", xlim=(0, None))
-                ax.set_ylim(0, float(np.clip(_upper(of_ratio, "p95"), 1.25, 1.5)))
+                ax.set_ylim(0, float(np.clip(highest, 1.25, 1.5)))
                 ax.set_title(titles[split])
         axes[0, 0].fill_between([], [], [], color=GREY, alpha=0.3, lw=0, label="Quartiles")
         axes[0, 0].plot([], [], color=GREY, lw=0.8, label="95 % quantile")
@@ -150,20 +138,19 @@ def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figu
     """Draw the control RMSE of the sequences (`control_error_table`), a row a split, a box a series: median,
     quartiles, and whiskers from the 5 % to the 95 % quantile."""
     panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
-    splits, series = distinct(table, "split"), distinct(table, "series")
+    splits, series = _groups(table, "split"), [*_groups(table, "series")]
     names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
     with matplotlib.rc_context(STYLE):
         figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
-        for row, split in enumerate(splits):
-            for ax, (column, label) in zip(axes[row], panels, strict=True):
-                of_series = [values(rows(table, split=split, series=name), column) for name in series]
+        for row, (split, part) in zip(axes, splits.items(), strict=True):
+            for ax, (column, label) in zip(row, panels, strict=True):
                 drawn = ax.boxplot(
-                    [each[np.isfinite(each)] for each in of_series],
+                    [part.loc[part["series"] == name, column].dropna() for name in series],
                     orientation="horizontal",
                     whis=(5, 95),
                     showfliers=False,
                     patch_artist=True,
-                    tick_labels=names if ax is axes[row, 0] else [""] * len(series),
+                    tick_labels=names if ax is row[0] else [""] * len(series),
                     medianprops={"color": BLACK},
                 )
                 for box, name in zip(drawn["boxes"], series, strict=True):
@@ -194,6 +181,48 @@ def tree_figure(anatomy: Anatomy) -> Figure:
     return figure
 
 
+def replay_figure(anatomy: Anatomy, found: Sequence[EpisodeReplay], title: str) -> Figure:
+    """Draw some episodes of a log's replay, the real tip beside the simulated one, in the plane and over time."""
+    chosen = evenly(len(found), MOST_SHOWN)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11, 3.1 * len(chosen)), layout="constrained", facecolor="white")
+        panels = np.atleast_2d(figure.subplots(len(chosen), 2, width_ratios=(1.0, 1.8)))
+        for row, k in enumerate(chosen):
+            _draw_plane(panels[row, 0], anatomy, found[k])
+            _draw_course(panels[row, 1], found[k])
+        figure.suptitle(title, x=0.01, ha="left")
+        figure.legend(*panels[0, 1].get_legend_handles_labels(), loc="outside lower right", ncols=4)
+        for axes in panels[:-1].ravel():
+            axes.set_xlabel("")
+    return figure
+
+
+def _draw_plane(axes: Axes, anatomy: Anatomy, episode: EpisodeReplay) -> None:
+    across, up = anatomy.tree.widest_axes()
+    anatomy.plot(axes=axes, color="#dfe3e8")
+    axes.plot(episode.seen[:, across], episode.seen[:, up], ".", color=BLACK, ms=3)
+    given, rest = episode.simulated[episode.given], episode.predicted[~episode.given]
+    axes.plot(given[:, across], given[:, up], color=ORANGE, lw=1.3)
+    axes.plot(rest[:, across], rest[:, up], color=VERMILLION, lw=1.3)
+    both = np.concatenate([episode.seen, episode.simulated])[:, [across, up]]
+    low, high = both.min(axis=0) - _SPARE_MM, both.max(axis=0) + _SPARE_MM
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title=f"episode {episode.number}")
+
+
+def _draw_course(axes: Axes, episode: EpisodeReplay) -> None:
+    time_s = episode.time_s - episode.time_s[0]
+    rest = ~episode.given
+    axes.plot(time_s, episode.driven, color=GREY, ls="--", lw=1.2, label="drive without vessel")
+    axes.plot(time_s, episode.abscissa[:, 0], ".", color=BLACK, ms=3, label="real tip")
+    axes.plot(time_s[episode.given], episode.abscissa[episode.given, 1], color=ORANGE, lw=1.4, label="simulated, given")
+    axes.plot(time_s[rest], episode.abscissa[rest, 1], color=VERMILLION, lw=1.4, label="predicted")
+    errors = episode.errors
+    axes.set(xlabel="time, s", ylabel="tip along the vessel Δtip, mm")
+    axes.set_title(
+        f"predicted: {errors['along']:.2f} mm along, {errors['across']:.2f} mm across", fontsize=9, fontweight="normal"
+    )
+
+
 def _grid(rows: int, columns: int, *, height: float) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:
     figure = Figure(figsize=(5.2 * columns if columns > 1 else 7.0, height * rows), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
@@ -205,8 +234,8 @@ def _style(series: str) -> dict[str, Any]:
 
 def _upper(table: pd.DataFrame, column: str) -> float:
     """Return an upper limit that shows every series whole, unless one runs away from all others."""
-    series = [values(rows(table, series=name), column) for name in distinct(table, "series")]
-    highest = sorted(float(np.nanmax(line)) for line in series if np.isfinite(line).any())
+    series = [float(line[column].max()) for line in _groups(table, "series").values()]
+    highest = sorted(value for value in series if np.isfinite(value))
     if not highest:
         return 1.0
     return 1.08 * min(highest[-1], 1.5 * highest[max(len(highest) - 2, 0)]) + 1e-6

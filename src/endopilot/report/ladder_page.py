@@ -19,7 +19,7 @@ from endopilot.ladder.submission import recorded_navigation
 from endopilot.ladder.terms import Terms
 from endopilot.plotting import GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.navigation_page import mark_exposures
-from endopilot.report.report import image, render
+from endopilot.report.report import image, write_page
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, list_tasks
@@ -29,7 +29,7 @@ SHOWN = 5  # patients of each task that the pictures show
 OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
 
 
-def write_page(output: Path) -> Path:
+def write_ladder_page(output: Path) -> Path:
     """Write index.html and replays into a folder that `climb` has filled, and return its path; InputError without
     scores."""
     content = read_json(output / SCORES_FILE)
@@ -40,7 +40,8 @@ def write_page(output: Path) -> Path:
         with writing(plotly) as partial:
             partial.write_text(get_plotlyjs(), encoding="utf-8")
     sections = [_section(output, task, content["patients"]) for task in tasks]
-    page = render(
+    write_page(
+        output / PAGE_FILE,
         "ladder.html.j2",
         title=f"The ladder: {content['policy']}",
         of=len(list_tasks(content["ladder"])),
@@ -49,8 +50,6 @@ def write_page(output: Path) -> Path:
         scores=content["scores"],
         sections=sections,
     )
-    with writing(output / PAGE_FILE) as partial:
-        partial.write_text(page, encoding="utf-8")
     return output / PAGE_FILE
 
 

@@ -20,9 +20,9 @@ from endopilot.belief.adviser import AdviserConfig
 from endopilot.control.navigate import PatientNavigation, SetUp
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.plan_picture import draw_route, legend_above
-from endopilot.files import json_text, writing
+from endopilot.files import json_text
 from endopilot.plotting import BLACK, BLUE, CATHETER_COLORS, GREY, ORANGE, PURPLE, STYLE, VERMILLION
-from endopilot.report.report import image, render
+from endopilot.report.report import image, write_page
 from endopilot.report.scene import mark_target, navigation_scene, scene_html
 from endopilot.simulation.world import read_world
 from endopilot.tasks.navigation import DECISION_PERIOD_S
@@ -36,7 +36,8 @@ def write_navigation_page(
     """Write the page as one HTML file that needs nothing beside it; InputError if it cannot be written."""
     name = found.set_up.navigation.anatomy.name
     outcome = tell_outcome(found)
-    page = render(
+    write_page(
+        path,
         "navigation.html.j2",
         title=f"{name}: to {name_target(found.set_up)}",
         outcome=outcome[0].upper() + outcome[1:] + ".",
@@ -52,8 +53,6 @@ def write_navigation_page(
         commands=commands,
         manifest=json_text(manifest),
     )
-    with writing(path) as partial:
-        partial.write_text(page, encoding="utf-8")
 
 
 def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:

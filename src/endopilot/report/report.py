@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 import html
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -43,53 +44,44 @@ class PatientContent:
     scores: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ReportContent:
-    """Everything that a pipeline has to report; what is None or empty is left out of the report.
-
-    Attributes:
-        origin: one sentence that says what the patients are: real, or synthetic and how made.
-        evaluation: folder made by `endopilot evaluate`; `navigation` of `endopilot navigate`, beside or below the
-            report.
-        replay: navigations with `shape`, in `replay_anatomy`, the first of which is shown in space.
-        manifest: how everything was made (`files.manifest`).
-    """
-
-    title: str
-    origin: str
-    command: str
-    patients: tuple[PatientContent, ...] = ()
-    evaluation: Path | None = None
-    replay: Trajectory | None = None
-    replay_anatomy: Path | None = None
-    navigation: Path | None = None
-    stage_seconds: Mapping[str, float] = field(default_factory=dict)
-    manifest: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_report(output_html: Path, content: ReportContent) -> None:
-    """Write the report as one HTML file. Raises InputError for a missing or damaged file, or a report that cannot be
-    written."""
-    output_html = Path(output_html)
-    metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
-    context = {
-        "title": content.title,
-        "content": content,
-        "metrics": metrics,
-        "text": report_text,
-        "patients": [_patient(patient) for patient in content.patients],
-        "driven": _driven(content.navigation, output_html.parent),
-        "scene": _scene(content),
-        "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
-        "manifest": json_text(content.manifest) if content.manifest else "",
-    }
-    page = render("report.html.j2", **context)
-    with writing(output_html) as partial:
-        partial.write_text(page, encoding="utf-8")
+def write_report(
+    output_html: Path,
+    *,
+    title: str,
+    origin: str,
+    command: str,
+    patients: Sequence[PatientContent] = (),
+    evaluation: Path | None = None,
+    replay: tuple[Path, Trajectory] | None = None,
+    navigation: Path | None = None,
+    stage_seconds: Mapping[str, float] = MappingProxyType({}),
+    manifest: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Write the report as one HTML file; what is not given is left out. `origin` is one sentence that says what the
+    patients are: real, or synthetic and how made. `evaluation` is a folder made by `endopilot evaluate`, `navigation`
+    one by `endopilot navigate`, beside or below the report; `replay` is the folder of an anatomy, and navigations in it
+    with `shape`, the first of which is shown in space; `manifest` says how everything was made (`files.manifest`).
+    Raises InputError for a missing or damaged file, or a report that cannot be written."""
+    write_page(
+        output_html,
+        "report.html.j2",
+        title=title,
+        origin=origin,
+        command=command,
+        stage_seconds=stage_seconds,
+        metrics=read_json(evaluation / METRICS_FILE) if evaluation is not None else None,
+        text=report_text,
+        patients=[_patient(patient) for patient in patients],
+        driven=_driven(navigation, output_html.parent),
+        scene=_scene(replay or (patients[0].anatomy, None)) if replay or patients else None,
+        figures={name: _stored_figure(evaluation, name) for name in report_text.EVALUATION_FIGURES},
+        record=manifest,
+        manifest=json_text(manifest) if manifest else "",
+    )
 
 
-def render(template: str, **content: Any) -> str:
-    """Return a page of the templates' folder with its style and its content."""
+def write_page(path: Path, template: str, **content: Any) -> None:
+    """Write a page of the templates' folder with its style and its content; InputError if it cannot be written."""
     made = Environment(
         loader=PackageLoader("endopilot.report", "templates"),
         autoescape=True,
@@ -98,7 +90,9 @@ def render(template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     css = (Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8")
-    return made.get_template(template).render(css=Markup(css), **content)
+    page = made.get_template(template).render(css=Markup(css), **content)
+    with writing(path) as partial:
+        partial.write_text(page, encoding="utf-8")
 
 
 def _patient(patient: PatientContent) -> dict[str, Any]:
@@ -128,11 +122,8 @@ def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
     }
 
 
-def _scene(content: ReportContent) -> dict[str, Any] | None:
-    folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
-    if folder is None:
-        return None
-    anatomy, replay = read_anatomy(folder), content.replay
+def _scene(shown: tuple[Path, Trajectory | None]) -> dict[str, Any]:
+    anatomy, replay = read_anatomy(shown[0]), shown[1]
     figure, caption = navigation_scene(anatomy, replay), f"The vessel of {anatomy.name}."
     if replay is not None:
         seconds = replay.valid.shape[1] * replay.period_s
@@ -185,13 +176,13 @@ def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
     for option in ("sequences", "seed"):
         value = record["config"][option]
         command += [] if value is None else [f"--{option}", str(value)]
-    content = ReportContent(
+    page = folder / REPORT_FILE
+    write_report(
+        page,
         title="endopilot: evaluation of a trained run",
         origin=f"The run {run}, on the dataset {dataset}.",
         command=" ".join(command),
         evaluation=folder,
         manifest=record,
     )
-    page = folder / REPORT_FILE
-    write_report(page, content)
     return page

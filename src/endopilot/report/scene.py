@@ -110,18 +110,9 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
             pieces.setdefault(int(section), []).extend([chosen, np.full((1, 3), np.nan)])
     lines, palette = [], section_colors(len(pieces))
     for number, (section, parts) in enumerate(sorted(pieces.items())):
-        x, y, z = np.concatenate(parts).astype(np.float32).T
-        lines.append(
-            go.Scatter3d(
-                x=x,
-                y=y,
-                z=z,
-                mode="lines",
-                line={"color": to_hex(palette(number)), "width": 5},
-                name=f"Section {tree.section_names[section]}",
-                hovertemplate=f"section {tree.section_names[section]}<extra></extra>",
-            )
-        )
+        points, name = np.concatenate(parts).astype(np.float32), tree.section_names[section]
+        how = {"name": f"Section {name}", "hovertemplate": f"section {name}<extra></extra>"}
+        lines.append(_line(points, color=to_hex(palette(number)), width=5, **how))
     return lines
 
 
@@ -234,7 +225,7 @@ def _state(rollout: Trajectory, sample: int, k: int) -> str:
     )
 
 
-def _line(points: np.ndarray, *, color: str, width: float, **how: object) -> go.Scatter3d:
+def _line(points: np.ndarray, *, color: str, width: int | float, **how: object) -> go.Scatter3d:
     x, y, z = points.T
     return go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": color, "width": width}, **how)
 

@@ -16,7 +16,6 @@ import math
 import re
 import secrets
 import shlex
-import signal
 import socket
 import ssl
 import stat
@@ -271,8 +270,8 @@ def _recipe(folder: Path) -> str:
 
 
 async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say: Callable[[str], None]) -> None:
-    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until SIGTERM, or until it
-    is cancelled; `say` is called with each line for people. InputError where the address cannot be listened on."""
+    """Let a drive, made with `now=time.monotonic()`, listen (on a free port with 0) and run until it is cancelled, or a
+    signal ends it; `say` is called with each line for people. InputError where the address cannot be listened on."""
 
     async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if drive.taken:
@@ -281,16 +280,14 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
         else:
             await _obey(drive, reader, writer)
 
-    terminated = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
-    listener = _listen(host, port)
+    listener = listen(host, port)
     server = await asyncio.start_server(
         admit, sock=listener, ssl=context, limit=READ_BYTES,
         ssl_handshake_timeout=AUTHENTICATE_S, ssl_shutdown_timeout=AUTHENTICATE_S,
     )  # fmt: skip
     say(f"listening on {host}:{listener.getsockname()[1]}")
     try:
-        while not terminated.is_set():
+        while True:
             await asyncio.sleep(min(CYCLE_S, max(drive.due - time.monotonic(), 0.0)))
             drive.tick(time.monotonic())
             while drive.news:
@@ -299,13 +296,18 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
         server.close()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int, named: str = "host, port") -> socket.socket:
+    """Return a TCP socket that listens on an address of this machine (0.0.0.0 or :: for all of them) and a port (0 for
+    a free one). InputError, which begins with the options' names, where that cannot be had."""
     try:
-        family, *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server((host, port), family=family)
+        family, *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+        listener = socket.create_server((host, port), family=family, dualstack_ipv6=both)
     except (OSError, UnicodeError) as error:
         why = str(getattr(error, "strerror", None) or error).partition(" (")[0]
-        raise InputError(f"host, port: cannot listen on {host}:{port} ({why}); choose others") from error
+        raise InputError(f"{named}: cannot listen on {host}:{port} ({why}); choose others") from error
+    # The protocol is named so that asyncio sends each message at once: it asks for that (TCP_NODELAY) only then.
+    return socket.socket(listener.family, listener.type, socket.IPPROTO_TCP, listener.detach())
 
 
 async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -21,7 +21,6 @@ from scipy.spatial import KDTree
 from endopilot.devices.robot import DriveConfig, through_play
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, box_text
-from endopilot.files import writing
 from endopilot.robot.bag import is_bag, read_bag
 from endopilot.simulation.csv_file import Columns, read_columns
 from endopilot.types import VesselTree
@@ -107,35 +106,6 @@ class RobotLog:
         before = self.command[:first][self.commanded[:first]]
         rest = self.rows(np.arange(len(self)) >= first)
         return replace(rest, command=rest.command - before[-1]) if self.by_velocity and len(before) else rest
-
-    def _velocities(self) -> Float[np.ndarray, "rows devices 2"]:
-        """Return the velocities that `command` is the sum of; the last one of an episode moves nothing."""
-        velocity = np.full_like(self.command, np.nan)
-        for number in np.unique(self.episode):
-            rows = np.flatnonzero((self.episode == number) & self.commanded)
-            holds = np.diff(self.time_s[rows], append=np.inf)[:, None, None]
-            velocity[rows] = np.diff(self.command[rows], axis=0, prepend=0.0) / holds
-        return velocity
-
-    def write(self, path: Path) -> None:
-        """Write it as `read_log` reads it, whole or not at all; the camera's file is not written."""
-        import pandas as pd
-
-        columns: dict[str, np.ndarray] = {"time_s": self.time_s, "episode": self.episode}
-        command = self._velocities() if self.by_velocity else self.command
-        for k, prefix in enumerate(column_prefixes(self.command.shape[1])):
-            for names, values in (
-                (_VELOCITY if self.by_velocity else _POSITION, command),
-                (_ENCODER, self.encoders),
-                (_LOAD, self.load),
-            ):
-                columns |= {prefix + name: values[:, k, i] for i, name in enumerate(names)}
-        seen = (_TIP, self.tip) if self.camera is None else (_PIXEL, self.pixel)
-        columns |= {name: seen[1][:, i] for i, name in enumerate(seen[0])}
-        columns["flag"] = (~self.used).astype(int)
-        table = pd.DataFrame(columns).dropna(axis="columns", how="all")
-        with writing(Path(path)) as partial:
-            table.to_csv(partial, index=False)
 
 
 def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence[str] = ()) -> RobotLog:

@@ -10,8 +10,8 @@ import socket
 import ssl
 import threading
 import time
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
@@ -27,7 +27,7 @@ ANSWER_S = 2.0
 """Time that the drive has to answer, s."""
 
 
-class RemoteRobot:
+class RemoteRobot(AbstractContextManager["RemoteRobot"]):
     """Commands a drive process, and reads its encoders, which sit at the motor, and its load. Any thread may call it.
     A call raises InputError once the connection is lost. No command beyond the `limits` that the drive reported is ever
     sent; `status` is "armed", or "stopped:" and why, as the drive last said."""
@@ -51,12 +51,8 @@ class RemoteRobot:
         self._living = threading.Thread(target=self._live, daemon=True)
         self._living.start()
 
-    def __enter__(self) -> RemoteRobot:
-        """Return the robot; leaving the block stops it and closes the connection."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Close the connection."""
+    def __exit__(self, *error: object) -> None:
+        """Close the connection, which stops the drive."""
         self.close()
 
     def command(self, devices: Proximals) -> Proximals:

@@ -276,14 +276,13 @@ def _proximal(
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Worlds of each episode: their tips where the real one was seen, how far they were from it while given, and the
-    drive's force at the ends of periods, N; NaN beyond an episode's end."""
+    """Worlds of each episode: their tips where the real one was seen, and the drive's force at the ends of periods, N;
+    NaN beyond an episode's end."""
 
     tip: Float[np.ndarray, "episodes worlds tips 3"]
     abscissa: Float[np.ndarray, "episodes worlds tips"]
     branch: Float[np.ndarray, "episodes worlds tips"]
     force: Float[np.ndarray, "episodes worlds periods"]
-    cost: Float[np.ndarray, "episodes worlds"]
 
 
 def _simulated(
@@ -321,15 +320,7 @@ def _simulated(
             tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
             nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
             branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]
-    return _Tried(tip, abscissa, branch, force, _costs(of, tip))
-
-
-def _costs(of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"]) -> Float[np.ndarray, "episodes worlds"]:
-    """Return how far tips are from the real ones on average, at most `FAR_MM`, as the camera sees them, mm. The last
-    ones count most: where the wire lies when the prediction begins matters."""
-    far = [_far_from(of, tip, k, of.given) for k in range(len(tip))]
-    weights = [np.exp(-np.arange(each.shape[1])[::-1] / each.shape[1] / _FADES) for each in far]
-    return np.stack([np.average(each, axis=1, weights=w) for each, w in zip(far, weights, strict=True)])
+    return _Tried(tip, abscissa, branch, force)
 
 
 def _far_from(
@@ -342,8 +333,9 @@ def _far_from(
 
 
 def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "episodes worlds"]:
-    """Return how likely the worlds of each episode are: by its given tips, and by how the log's episodes before ended.
-    A wire that nobody clamped anew keeps its rotation on the drive, as the rotations so far tell."""
+    """Return how likely the worlds of each episode are: by how far its given tips are from the real ones, of which the
+    last count most, for where the wire lies when the prediction begins matters, and by how the log's episodes before
+    ended. A wire that nobody clamped anew keeps its rotation on the drive, as the rotations so far tell."""
     found, count, before = np.empty((len(of.logs), len(angles))), len(angles), ""
     known, trust = np.empty(count), 0.0
     for k, log in enumerate(of.logs):
@@ -353,7 +345,9 @@ def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) ->
         near = np.exp((np.cos(on_drive) - 1) / _KEEPS_RAD**2)
         near /= near.sum(axis=0)
         foretold = trust * near @ known + (1 - trust) / count
-        found[k] = foretold * np.exp((tried.cost[k].min() - tried.cost[k]) / _TELLS_MM)
+        far = _far_from(of, tried.tip, k, of.given)
+        cost = np.average(far, axis=1, weights=np.exp(-np.arange(far.shape[1])[::-1] / far.shape[1] / _FADES))
+        found[k] = foretold * np.exp((cost.min() - cost) / _TELLS_MM)
         whole = _far_from(of, tried.tip, k, of.courses.seen).mean(axis=1)
         likely = np.exp((whole.min() - whole) / _TELLS_MM)
         trust = float(np.clip(trust * (near @ known @ likely) / (foretold @ likely), 0.05, 0.95))

@@ -14,7 +14,6 @@ from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Proximals
 from endopilot.simulation.robots import Recorder, Robots, backs_out_mm
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import Step
 
 CYCLE_S = 0.05
 """Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
@@ -49,7 +48,7 @@ class Robot(Protocol):
 
 class SimulatedRobot:
     """A robot whose wire, and catheters if it has any, are the one world of a simulator, each with a drive of its own.
-    `recorder` has what they were asked for and truly did in each cycle, `last_step` what in the last; None before."""
+    `recorder` has what they were asked for and truly did in each cycle."""
 
     def __init__(
         self,
@@ -71,7 +70,6 @@ class SimulatedRobot:
         self._backs_out_s, self._backs_out_mm = backs_out
         self._readings: list[Float[np.ndarray, "devices 4"]] = []
         self.recorder = Recorder(simulator, cycle_s)
-        self.last_step: Step | None = None
 
     @property
     def velocity(self) -> Float[np.ndarray, "devices 2"]:
@@ -105,9 +103,9 @@ class SimulatedRobot:
             due = self._robots.motion.time_s >= self._backs_out_s - period / 2
             back_mm = backs_out_mm(self._simulator, due, self._backs_out_mm, period)
             self._backs_out_mm -= float(back_mm[0])
-            self.last_step, read = self._robots.drive(self._simulator, period, self.recorder.step, back_mm)
+            step, read = self._robots.drive(self._simulator, period, self.recorder.step, back_mm)
             self._readings.append(read[0])
-            peak = max(peak, float(self.last_step.contact_force_max[0]))
+            peak = max(peak, float(step.contact_force_max[0]))
         return peak
 
     @property
