@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import or_
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import Field
@@ -129,7 +130,7 @@ def _plain(kind: Any) -> Any:
     if get_origin(kind) is Annotated:
         return _plain(get_args(kind)[0])
     if get_origin(kind) is tuple:
-        return list[_plain(get_args(kind)[0])] if get_args(kind)[-1] is ... else kind
+        return GenericAlias(list, _plain(get_args(kind)[0])) if get_args(kind)[-1] is ... else kind
     if get_args(kind) and get_origin(kind) is not Literal:
         return reduce(or_, map(_plain, get_args(kind)))
     return str if kind is Path else kind
