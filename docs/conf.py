@@ -3,7 +3,6 @@
 import contextlib
 import os
 import re
-import sys
 import tempfile
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from endopilot import __version__
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads slow each other down on a busy machine
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))  # `benchmarks`
 
 project = "endopilot"
 author = "the endopilot authors"

@@ -18,6 +18,7 @@ check.
 # This one pushes and looks once a second. After a wrong branch it pulls back to before the fork, turns the wire by
 # 120°, and pushes again. It lies in a file of its own, so that the ladder's processes find it too.
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -51,7 +52,7 @@ class TurnBack:
 """
 folder = Path(tempfile.mkdtemp())
 (folder / "my_policy.py").write_text(CODE, encoding="utf-8")
-sys.path.insert(0, str(folder))  # `endopilot ladder` also looks where it is called
+sys.path.insert(0, str(folder))
 from my_policy import TurnBack
 
 # %%
@@ -92,6 +93,7 @@ plt.show()
 # patients take some minutes. Several processes drive the navigations: in a script of your own, make the call under
 # ``if __name__ == "__main__":``.
 
+os.chdir(folder)  # the ladder's processes look for a policy where they are called
 safe_success = {}
 for policy in ("forward", "my_policy:TurnBack"):
     config = endopilot.LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)
@@ -106,6 +108,7 @@ for policy in ("forward", "my_policy:TurnBack"):
 # can drive these controls again, without the policy, and compare every figure to the bit. On the command line:
 # ``endopilot ladder --check submission.json``.
 
+os.chdir(folder)
 checked = endopilot.check_submission(folder / "my_policy-TurnBack" / "submission.json")
 print(f"{checked.policy}: {checked.navigations} navigations, first difference: {checked.difference}")
 

@@ -59,6 +59,23 @@ def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
     assert (folder / "rollout.csv").exists()
 
 
+def test_what_may_be_several_is_a_list(folder) -> None:
+    bag = pytest.importorskip("rosbags.rosbag1", reason="the extra `ros` is not installed")
+    with bag.Writer(folder / "my.bag"):
+        pass
+    topics = ["command=/drive", "tip=/tip"]
+    several = {"logs": ["my.bag", "../secret/anatomy.json"], "anatomy": "patient", "output": "r.yaml"}
+    tools, (replayed, calibrated) = asked(
+        folder,
+        ("replay", {"log": "my.bag", "anatomy": "patient", "output": "r", "topics": topics}),
+        ("calibrate", several),
+    )
+    kinds = {tool.name: tool.input_schema["properties"] for tool in tools}
+    assert kinds["replay"]["topics"]["type"] == kinds["anatomy"]["sources"]["type"] == "array"
+    assert "my.bag" in replayed.content[0].text and "/drive" in replayed.content[0].text
+    assert "logs: ../secret/anatomy.json leads out" in calibrated.content[0].text
+
+
 @pytest.mark.parametrize(
     ("name", "given", "said"),
     [

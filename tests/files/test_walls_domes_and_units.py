@@ -142,7 +142,8 @@ def test_a_volume_mesh_of_vtk_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "word"), [(".swc", "VTP"), (".fcsv", "mrk.json"), (".ctgr", "VTU"), (".glb", "STL")]
+    ("suffix", "word"),
+    [(".csv", "Polylines"), (".swc", "VTP"), (".fcsv", "mrk.json"), (".ctgr", "VTU"), (".glb", "STL")],
 )
 def test_a_kind_that_is_not_read_is_told_how_to_convert(tmp_path, suffix, word):
     (tmp_path / f"tree{suffix}").write_text("x")

@@ -204,6 +204,7 @@ def test_without_the_libraries_of_its_page_a_ladder_says_what_is_left_out(climbe
         main(["ladder", "--policy", "forward", "--tasks", "straight", "--patients", "1", "-o", str(climbed[0])])
     printed = capsys.readouterr().out
     assert left.value.code == 0 and "submission" in printed
+    assert {"task", "safe", "X-rays", "force", "time"} <= {*printed.split()}, "no word is cut"
     assert "left_out    the page, which needs: pip install 'endopilot[report]'" in printed
 
 

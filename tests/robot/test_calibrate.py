@@ -22,6 +22,7 @@ from endopilot.robot.calibrate import (
     calibrate,
     check_clockwise,
     fit_wire,
+    gained,
     left_out_share,
 )
 from endopilot.robot.candidates import Estimate
@@ -152,3 +153,9 @@ def test_a_band_for_another_session_is_wider_than_one_for_another_episode() -> N
     assert 0.86 < left_out_share(errors[:8].ravel(), logs) < 0.98
     assert bands(errors[0], ["log"] * 30)[0] is None and left_out_share(errors[0], ["log"] * 30) is None
     assert bands(errors[0, :8], ["log"] * 8) == (None, None)  # no band is surer than 8/9
+
+
+def test_a_layer_tells_how_many_that_were_left_out_it_predicts_better() -> None:
+    costs = np.array([0.3, -0.2, 0.1, -0.1])  # logarithms: their mean may be anything
+    assert gained(costs, costs - [2.0, 3.0, 2.5, -0.1], 0.9) == "3 of 4 that were left out cost less"
+    assert gained(costs, costs + np.array([1.0, -1.0, 1.0, -1.0]), 0.9) == "no gain, left out"

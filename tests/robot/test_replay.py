@@ -49,6 +49,13 @@ def test_the_robot_that_logged_is_predicted(fork, wire, robot, made) -> None:
         assert np.pi / FEW.rotations <= each.rotation_known_rad + 1e-9 < 1.0  # half a step at least
 
 
+def test_an_episode_may_push_farther_in_all_than_the_vessel_is_long(fork, wire, robot) -> None:
+    log, _ = logged_and_true(fork, wire, robot, episodes=1, seconds=40.0, seed=5)
+    pushed_mm = np.maximum(np.diff(log.command[log.commanded, 0, 0]), 0.0).sum()
+    assert pushed_mm > fork.tree.longest_path().abscissa[-1] + 20.0
+    assert summary(replay_log([log], fork, Stack(wire), robot=robot, config=FEW))["error_along_mm"] < 0.3
+
+
 def test_what_a_camera_does_not_see_counts_for_nothing(fork, wire, robot, log) -> None:
     """The camera looks along y: a tip that lies elsewhere in y is the same pixel."""
     camera = PlanarCamera(mm_per_pixel=0.1, columns=(1.0, 0.0, 0.0), rows=(0.0, 0.0, -1.0))

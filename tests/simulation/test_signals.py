@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from dataclasses import fields, replace
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from endopilot import _core
+from endopilot.dataset.loader import Dataset
 from endopilot.dataset.schema import OWN_COLUMNS, STATE
 from endopilot.simulation.signals import SIGNALS, Outputs, table_columns
 from endopilot.simulation.trajectory import Step, Trajectory, trajectory_table
@@ -36,6 +39,12 @@ def test_every_output_is_described_and_has_its_columns_in_tables_and_in_data_set
     assert stored >= {each.name for each in fields(Outputs)}
     columns = [column for each in SIGNALS.values() for column in each.columns]
     assert len(columns) == len(set(columns))
+
+
+@pytest.mark.parametrize("kind", [Dataset, Trajectory])
+def test_no_attribute_is_described_twice(kind) -> None:
+    named = re.findall(r"^ {8}(\w+): ", kind.__doc__, re.MULTILINE)
+    assert "valid" in named and len(named) == len({*named})
 
 
 def test_columns_of_devices_come_one_device_after_the_other() -> None:

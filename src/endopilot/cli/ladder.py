@@ -52,6 +52,7 @@ def ladder_command(
     if dataset is not None:
         require_extras("learn")  # before hours of work
     from endopilot.ladder.submission import SUBMISSION_FILE
+    from endopilot.ladder.table import CLIMBED, shown_row
 
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
@@ -62,7 +63,7 @@ def ladder_command(
         made = {"scores": folder / MISMATCH_FILE}
     else:
         made = (_page(folder) if page else {}) | {"submission": folder / SUBMISSION_FILE}
-    return Answer(rows, [rows, made])
+    return Answer(rows, [[shown_row(row, CLIMBED) for row in rows], made])
 
 
 def _page(folder: Path) -> dict[str, Any]:
@@ -74,7 +75,7 @@ def _page(folder: Path) -> dict[str, Any]:
 
 
 def _tabulated(folder: Path | None) -> Answer:
-    from endopilot.ladder.table import PLACES, missing, shown_row, tabulate, terms_in_words
+    from endopilot.ladder.table import PLACES, TABLED, missing, shown_row, tabulate, terms_in_words
 
     rows = tabulate(*([folder] if folder else filter(Path.is_dir, map(Path, PLACES))))
     shown, none = dict[str, list[dict[str, Any]]](), dict[tuple[str, str], list[str]]()
@@ -82,7 +83,7 @@ def _tabulated(folder: Path | None) -> Answer:
         none.setdefault((cell["policy"], cell["terms"]["ladder"]), []).append(cell["task"])
     for row in rows:
         title = terms_in_words(row["terms"]) + ("\nas submissions say" if row["source"] == "file" else "")
-        shown.setdefault(title, []).append(shown_row(row))
+        shown.setdefault(title, []).append(shown_row(row, TABLED))
     parts = [part for title, some in shown.items() for part in (title, some, "")]
     parts += [f"No row of {policy}, {ladder}: {', '.join(tasks)}" for (policy, ladder), tasks in none.items()]
     return Answer(rows + missing(rows), parts)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import or_
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import Field
@@ -63,8 +64,8 @@ TOOLS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"robot": str, "wire": str, "error_along_mm": float, "estimates": dict[str, dict[str, Any]]},
     ),
 }
-"""Options of the command that each tool is, and what the tool answers; a list of such answers where the command's
-figures are rows."""
+"""Options of the command that each tool is, and what the tool answers; those of `_ROWS` a list of such answers."""
+_ROWS = ("anatomy", "atlas", "devices")
 
 
 def mcp_command(folder: Existing, /) -> None:
@@ -106,9 +107,8 @@ def _tool(folder: Path, name: str) -> Callable[..., Any]:
         except InputError as error:
             raise ToolError(str(error).replace(f"{folder}/", "")) from None
         figures = answer.figures if isinstance(answer, Answer) else answer
-        return _answer(folder, figures, answered) if isinstance(figures, Mapping) else [
-            _answer(folder, row, answered) for row in figures
-        ]  # fmt: skip
+        answers = [_answer(folder, row, answered) for row in ([figures] if isinstance(figures, Mapping) else figures)]
+        return answers if name in _ROWS else answers[0]
 
     parameters = [
         inspect.Parameter(
@@ -119,26 +119,37 @@ def _tool(folder: Path, name: str) -> Callable[..., Any]:
         )
         for each in options.values()
     ]
-    rows = name in ("atlas", "devices")
-    vars(tool)["__signature__"] = inspect.Signature(parameters, return_annotation=list[kind] if rows else kind)
+    returned = list[kind] if name in _ROWS else kind
+    vars(tool)["__signature__"] = inspect.Signature(parameters, return_annotation=returned)
     tool.__name__, tool.__doc__ = name, made.summary
     return tool
 
 
 def _plain(kind: Any) -> Any:
-    """Return the type of an option as an assistant gives it: text for a path, one of several."""
-    if get_origin(kind) is Annotated or get_origin(kind) is tuple:
-        return _plain(get_args(kind)[0]) if get_origin(kind) is Annotated or get_args(kind)[-1] is ... else kind
+    """Return the type of an option as an assistant gives it: text for a path, a list of any number."""
+    if get_origin(kind) is Annotated:
+        return _plain(get_args(kind)[0])
+    if get_origin(kind) is tuple:
+        return GenericAlias(list, _plain(get_args(kind)[0])) if get_args(kind)[-1] is ... else kind
     if get_args(kind) and get_origin(kind) is not Literal:
         return reduce(or_, map(_plain, get_args(kind)))
     return str if kind is Path else kind
 
 
 def _words(folder: Path, option: Option, value: Any) -> list[str]:
-    """Return an option as words of a command line; InputError for a path out of the folder, by `..`, as an absolute one
-    or by a link, or for a name of code that is not the package's own."""
-    if value is None or value == ():
+    """Return an option as words of a command line; InputError as `_word` has it."""
+    if value is None:
         return []
+    if isinstance(value, list | tuple):
+        words = [_word(folder, option, each) for each in value]
+        return words if option.positional or not words else [option.flags[-1], *words]
+    word = _word(folder, option, value)
+    return [word] if option.positional else [f"{option.flags[-1]}={word}"]
+
+
+def _word(folder: Path, option: Option, value: Any) -> str:
+    """Return a value as a word of a command line; InputError for a path out of the folder, by `..`, as an absolute one
+    or by a link, or for a name of code that is not the package's own."""
     own = {"policy": POLICIES.shipped, "method": METHODS.shipped}.get(option.name)
     if own is not None and value not in own and value != option.value:
         raise InputError(f"{option.name}: {value!r}; choose from {', '.join(own)}")
@@ -147,7 +158,7 @@ def _words(folder: Path, option: Option, value: Any) -> list[str]:
         if not place.is_relative_to(folder):
             raise InputError(f"{option.name}: {value} leads out of the folder of this server; give a path in it")
         value = place
-    return [str(value)] if option.positional else [f"{option.flags[-1]}={value}"]
+    return str(value)
 
 
 def _answer(folder: Path, figures: Mapping[str, Any], answered: Mapping[str, Any]) -> dict[str, Any]:

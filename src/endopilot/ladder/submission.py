@@ -90,8 +90,8 @@ class Submission:
 
     `key` must be equal for two files to be compared (`key_of`); it follows from all else here. `origin` is the package
     and version of the policy, or its file and the SHA-256 of that; `core` the processor level of the rod core, `blas`
-    kernels of linear algebra and of numpy's functions (`KERNELS`). Nothing confirms `decision_ms`, how long decisions took, ms,
-    median and 99th percentile: another machine takes another time."""
+    kernels of linear algebra and of numpy's functions (`KERNELS`). Nothing confirms `decision_ms`, how long decisions
+    took, ms, median and 99th percentile: another machine takes another time."""
 
     format: Literal[1] = 1
     ladder: LadderVersion

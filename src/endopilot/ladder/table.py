@@ -19,6 +19,18 @@ PUBLIC = ("archvariety", "dualdevicenav")
 """Tasks of a public benchmark: `examples/steve_tasks.py` makes a folder of each."""
 TITLES = {2: "Version 2", "coaxial": "Wire and catheter", 1: "Version 1"}
 """Of the shipped versions of the ladder."""
+_SCORES = {"safe_%": "safe", "95_%": "interval", "X-rays": "exposures", "force_N": "peak_force_n", "time_s": "seconds"}
+TABLED = {
+    "task": "task",
+    "policy": "policy",
+    "n": "navigations",
+    **_SCORES,
+    "decide_ms": "decision_ms",
+    "p99_ms": "p99_ms",
+}
+"""Titles that `shown_row` prints of a row of the table."""
+CLIMBED = {"task": "task", "case": "case", **_SCORES, "missed_share": "missed_events", "plan_s": "planning_s"}
+"""The same of what a policy has just climbed; its JSON has all scores."""
 _Run = tuple[Mapping[str, Any], str, str, Mapping[str, list[dict[str, Any]]], tuple[float, float] | None]
 """Terms, policy, source, of each task the results of its navigations, and how long decisions took, ms."""
 
@@ -79,12 +91,11 @@ def _runs(folder: Path) -> Iterator[_Run]:
             yield read.terms.key(), read.policy, "file", navigations, read.decision_ms
 
 
-def shown_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is printed of a row, within 80 columns: shares in %, the interval in one."""
+def shown_row(row: Mapping[str, Any], columns: Mapping[str, str]) -> dict[str, Any]:
+    """Return what is printed of a row of scores, by title: those of the columns that it has, within 80 characters."""
     safe, *interval = (f"{100 * row[name]:.0f}" for name in ("safe_success", "safe_from", "safe_to"))
-    figures = {"task": row["task"], "policy": row["policy"], "n": row["navigations"]}
-    figures |= {"safe_%": safe, "95_%": "–".join(interval), "X-rays": row["exposures"], "force_N": row["peak_force_n"]}
-    return figures | {"time_s": row["seconds"], "decide_ms": row["decision_ms"], "p99_ms": row["p99_ms"]}
+    figures = {**row, "safe": safe, "interval": "–".join(interval)}
+    return {title: figures[name] for title, name in columns.items() if name in figures}
 
 
 def terms_in_words(terms: Mapping[str, Any]) -> str:

@@ -207,10 +207,10 @@ def check_clockwise(of: Prepared, device: Wire, robot: RobotConfig, config: Cali
 
 
 def gained(without: Float[np.ndarray, "units"], costs: Float[np.ndarray, "units"], level: float) -> str:
-    """Return what a layer gained on units that were left out, or that it is left out."""
+    """Return how many units that were left out a layer predicts better, or that the layer is left out."""
     if not earns(without, costs, level):
         return LEFT_OUT
-    return f"{(without - costs).mean() / np.abs(without).mean():.0%} less cost on episodes left out"
+    return f"{np.sum(costs < without)} of {len(costs)} that were left out cost less"
 
 
 def _driven(robot: RobotConfig, fit: DriveFit) -> RobotConfig:

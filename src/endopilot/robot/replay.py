@@ -308,10 +308,12 @@ def _simulated(
         last, worlds = int(samples[some].max()), angles[some].size
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
         initial[..., 1] += angles[some]
-        deepest = float(place[..., 0].max())
-        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, reach_mm=deepest)
-        made.reset(inserted_length=initial[..., 0].reshape(-1, 1), rotation=initial[..., 1].reshape(-1, 1))
+        begun, turned = (initial[..., axis].reshape(-1, 1) for axis in range(2))
         driven = np.repeat(control[some, :last], angles.shape[1], axis=0)[:, :, None]
+        pushed = begun + np.maximum(driven[..., 0] * _PERIOD_S, 0.0).sum(axis=1)  # none of the pulls may be made
+        deepest = float(max(place[..., 0].max(), pushed.max()))
+        made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, reach_mm=deepest)
+        made.reset(inserted_length=begun, rotation=turned)
         moved = made.run(driven, period_s=_PERIOD_S)
         for row, (k, j) in enumerate((k, j) for k in some for j in range(angles.shape[1])):
             ends = times[k, 1 : last + 1]

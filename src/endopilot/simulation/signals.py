@@ -98,10 +98,10 @@ _Class = TypeVar("_Class", bound=type)
 
 
 def described(kind: _Class) -> _Class:
-    """Complete the attributes of a class's docstring by the outputs that it has, as the core describes them."""
+    """Complete the attributes of a class's docstring by the signals that it has and does not describe itself."""
     text = (kind.__doc__ or "").rstrip()
     text += "" if "Attributes:" in text else "\n\n    Attributes:"
-    for name in (each.name for each in fields(kind) if each.name in SIGNALS):
+    for name in (each.name for each in fields(kind) if each.name in SIGNALS and f"\n        {each.name}: " not in text):
         unit = SIGNALS[name].unit
         text += f"\n        {name}: {SIGNALS[name].meaning}{', ' if unit else ''}{unit}."
     kind.__doc__ = text + "\n    "

@@ -25,7 +25,10 @@ from endopilot.vessels.sources import (
 MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtu", ".vtk")
 
+_TABLE = "a table of points and radii becomes an anatomy in Python, by endopilot.Polylines (docs/guide/patient.md)"
 _CONVERT = {
+    ".csv": _TABLE,
+    ".txt": _TABLE,
     ".swc": "write its points as the lines of a VTP with an array Radius (mm)",
     ".fcsv": "its points are a list without radii; open it in Slicer and save a centerline curve as .mrk.json",
     ".ctgr": "SimVascular's contours are no wall; export its model as VTP or its mesh as VTU",
