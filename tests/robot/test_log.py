@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +60,6 @@ def test_velocities_are_summed_up_to_where_a_command_ends(tmp_path) -> None:
     np.testing.assert_allclose(again.command, log.command)
     assert again.by_velocity
     assert log.camera is None and log.seen.tolist() == [False, True, False, False, False]
-
-
-def test_a_table_of_a_spreadsheet_is_read(tmp_path) -> None:
-    path = written(tmp_path, LOG.replace(",", ";").replace(".", ","))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        log = read_log(path)
-    assert np.array_equal(log.command, read_log(written(tmp_path, LOG)).command, equal_nan=True)
 
 
 def test_a_log_is_written_as_it_is_read(tmp_path) -> None:
