@@ -49,14 +49,6 @@ def test_json_takes_numpy_values_and_paths(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json") == {"x": 1.5, "n": [0, 1, 2], "p": "q"}
 
 
-@pytest.mark.parametrize("text", [None, "{"])
-def test_missing_or_broken_json_is_reported_in_one_line(tmp_path: Path, text: str | None) -> None:
-    if text is not None:
-        (tmp_path / "a.json").write_text(text)
-    with pytest.raises(InputError, match=r"a\.json"):
-        read_json(tmp_path / "a.json")
-
-
 def test_manifest_names_versions_machine_and_inputs(tmp_path: Path) -> None:
     (tmp_path / "in").write_bytes(b"endopilot")
     record = manifest(config={"a": 1}, seed=3, inputs=input_hash(tmp_path / "in"), wall_seconds=2.0)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_shapes import mask_of
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 
+from benchmarks.anatomy.analytic_lumens import mask_of
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_shapes import forked_tree
 
+from benchmarks.anatomy.analytic_lumens import forked_tree
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres
 from endopilot.anatomy.io import read_anatomy, write_anatomy

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from analytic_shapes import forked_tree
 
-from benchmarks.anatomy.analytic_lumens import tree_of
+from benchmarks.anatomy.analytic_lumens import forked_tree, tree_of
 from endopilot.anatomy.projection import project_tip, safety_ratio
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.types import Insertion

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_shapes import forked_tree, mask_of, torus_distance, tree_distance
 from scipy.spatial.transform import Rotation
 
+from benchmarks.anatomy.analytic_lumens import forked_tree, mask_of, torus_distance, tree_distance
 from endopilot.anatomy.catheter_axis import lean_between, turned_axis
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample
 from endopilot.anatomy.labels import label_tree

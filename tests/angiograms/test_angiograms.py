@@ -14,11 +14,11 @@ import pydicom
 import pytest
 import SimpleITK as sitk
 
+from command import run
 from endopilot import make_angiograms
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.angiograms.cine import CLASSES
 from endopilot.angiograms.config import AngiogramsConfig
-from endopilot.cli import main
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume, write_volume
@@ -203,11 +203,8 @@ def test_a_cluster_gives_the_same_bits(made, patient, tmp_path, monkeypatch):
 def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("endopilot.angiograms.draw._NAVIGATION_S", 3.0)
     settings = ["--cines", "1", "--seconds", "0.4", "--frames-per-second", "5", "--pixels", "64", "--pixel-mm", "1.3"]
-    where = ["angiograms", str(patient), "-o", str(tmp_path / "o"), "--json"]
-    with pytest.raises(SystemExit) as left:
-        main([*where, *settings, "--drive", "forward", "--device-share", "1", "--injected-share", "0"])
-    assert left.value.code == 0
-    assert json.loads(capsys.readouterr().out)["train_frames"] == 2
+    settings += ["--drive", "forward", "--device-share", "1", "--injected-share", "0"]
+    assert run(capsys, "angiograms", patient, "-o", tmp_path / "o", *settings)["train_frames"] == 2
     truth = np.load(tmp_path / "o" / "cines" / "fork-0000" / "truth.npz")
     assert truth["inserted_length_mm"].shape == (2, 1)
     assert truth["centerline_contrast"].max() == 0

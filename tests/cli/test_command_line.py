@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from command import refused
+from command import run as figures_of
 from endopilot.cli import COMMANDS, GROUPS, command_of, main
 from endopilot.cli.arguments import show
 from endopilot.cli.options import LISTED_AT_MOST, Command, Option
@@ -93,11 +95,7 @@ def test_a_missing_input_is_reported_in_one_line(
     arguments: tuple[str, ...], tmp_path: Path, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as leaving:
-        main(list(arguments))
-    told = capsys.readouterr()
-    assert leaving.value.code == 2 and told.out == ""
-    assert len(told.err.strip().splitlines()) == 1 and "missing" in told.err, told.err
+    assert "missing" in refused(capsys, *arguments)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -313,11 +311,8 @@ def test_the_pages_are_made_of_the_commands() -> None:
 @pytest.mark.parametrize(("option", "deepest_mm"), [((), 35.0), (("--no-stop-short",), 39.0)])
 def test_random_navigations_stop_short_of_ends_unless_asked_otherwise(vessel, tmp_path, capsys, option, deepest_mm):
     """The vessel ends at 40 mm, its branch too; a tip stops 5 mm before."""
-    options = ("--sequences", "3", "--seconds", "20", "--seed", "1", "--json")
-    with pytest.raises(SystemExit) as leaving:
-        main(["simulate", str(vessel), "-o", str(tmp_path / "run.csv"), *option, *options])
-    assert leaving.value.code == 0
-    figures = json.loads(capsys.readouterr().out)
+    options = ("--sequences", "3", "--seconds", "20", "--seed", "1")
+    figures = figures_of(capsys, "simulate", vessel, "-o", tmp_path / "run.csv", *option, *options)
     assert figures["valid_worlds"] == 3
     if not option:
         assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= deepest_mm + 0.5

@@ -1,4 +1,4 @@
-"""The policies that plan in the rod core: how they arrive, look, lose the wire, and give up."""
+"""The policies that plan in the rod core: how they arrive, look, lose the wire, give up, and what they then propose."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from endopilot.belief.watch import MISMATCH
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import CALIBRATIONS, read_agent_calibration
 from endopilot.control.course import Course
+from endopilot.control.navigate import NavigateConfig, navigate, propose_devices
+from endopilot.control.outcome import decision_times, tell_outcome
 from endopilot.devices.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Target
+from endopilot.tasks.targets import find_target
 from endopilot.types import TipProjection
 from toy_belief import QUICK, measured
 
@@ -280,3 +283,23 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
     assert again is not None and again.reached == 0 and 3.95 * again.force.max(initial=0.0) <= limited.force_limit_n
     said = next(words for period in range(2, 60) if (words := decide(period).gives_up))
     assert re.search(r"cannot go on .* N is given, and the drive pushes 4\.\d times as hard", said)
+
+
+def test_a_tip_that_enters_the_fork_is_named_and_nothing_where_nothing_does(side_branch) -> None:
+    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
+    given = replace(side_branch, device=straight)
+    assert propose_devices(given).startswith(f"{straight.name} with a tip of ")
+    assert propose_devices(replace(given, force_limit_n=1e-4), seconds=1e-6) == ""
+
+
+def test_the_outcome_names_it_and_each_decision_is_timed(side_branch) -> None:
+    """A straight tip cannot be shaped by hand here, so the target behind the fork is given up."""
+    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
+    point = ",".join(f"{each:.2f}" for each in side_branch.target.position(side_branch.anatomy))
+    assert find_target(side_branch.anatomy.tree, point).branch == 2
+    found = navigate(side_branch.anatomy, point, device=straight, config=NavigateConfig(tip="own", seconds=20.0))
+    assert found.record.gives_up and found.proposal
+    assert f"in a search {found.proposal} reaches it" in tell_outcome(found)
+    times = decision_times(found)
+    assert len(found.decision_s) == len(found.record.time_s) - 1 and (found.decision_s > 0).all()
+    assert times["median"] <= times["p99"] <= times["longest"] == round(float(np.max(found.decision_s)), 3)

@@ -13,12 +13,8 @@ from endopilot.control.reach import ROTATIONS, forks, rotations_that_enter
 from endopilot.control.set_up import choose_tip
 from endopilot.devices.device import lateral_reach
 from endopilot.errors import InputError
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
-from endopilot.simulation.rod import lay_out
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.route import Route
-from endopilot.types import Insertion
 from toy_fork import make_fork
 
 RADIUS_MM = 2.6
@@ -33,22 +29,10 @@ def wide(wire) -> Navigation:
 @pytest.mark.parametrize(
     ("angle_deg", "length_mm", "reach_mm"), [(45.0, 3.0, 1.119), (75.0, 5.0, 2.831), (90.0, 8.0, 5.093)]
 )
-def test_reach_is_that_of_an_arc(wire, angle_deg, length_mm, reach_mm) -> None:
+def test_reach_is_that_of_an_arc(angle_deg, length_mm, reach_mm) -> None:
     """An arc of angle θ and length L has the radius L/θ, and its end lies L/θ·(1 − cos θ) beside its tangent."""
     assert lateral_reach(np.radians(angle_deg), length_mm) == pytest.approx(reach_mm, abs=1e-3)
     assert lateral_reach(-np.radians(angle_deg), length_mm) == pytest.approx(reach_mm, abs=1e-3)
-    shaped, config = wire.shaped(angle_deg, length_mm), SimulatorConfig(element_mm=0.25, threads=1)
-    free = run_core(
-        lay_out(shaped, element_mm=0.25, length_mm=30.0),
-        None,  # no wall: the wire takes its own shape
-        Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])),
-        config=config,
-        initial=np.array([[20.0, 0.0]]),
-        control=np.zeros((1, 20, 2)),
-        friction=np.zeros(1),
-        approach=False,
-    )
-    assert np.hypot(*free["tip_position"][0, -1, 0, :2]) == pytest.approx(reach_mm, rel=0.02)
 
 
 def test_reach_of_tips_without_and_with_more_than_half_a_turn() -> None:

@@ -14,11 +14,9 @@ from endopilot.control.course import Course, places_of
 from endopilot.control.search import Search
 from endopilot.control.trials import CATHETER, WIRE
 from endopilot.devices.catheter import read_catheter
-from endopilot.errors import InputError
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.route import Route
@@ -76,19 +74,6 @@ def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch,
     assert (np.abs(course.control).sum(axis=(1, 2)) > 0).all()  # without pauses
 
 
-def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None:
-    belief, course = found
-    like = belief.simulator
-    again = Simulator(side_branch.anatomy, side_branch.stack, config=like.config)
-    again.copy_worlds([0], of=like)
-    for k, control in enumerate(course.control):
-        for _ in range(5):  # as `drive_period` does
-            again.step(control[None], DECISION_PERIOD_S / 5)
-        assert np.array_equal(again.proximal[0], course.proximal[k])
-        assert again.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
-    assert side_branch.reached(again.project())[0]
-
-
 def test_where_no_manoeuvre_passes_the_search_says_where(side_branch, found) -> None:
     weak = replace(side_branch, force_limit_n=1e-6)
     one, _, course = search(weak)
@@ -144,13 +129,6 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
         loop.step()
     record = loop.record()
     assert record.reason == "reached" and record.safe and record.exposed[5]
-
-
-def test_the_agent_drives_one_catheter(side_branch) -> None:
-    outer = read_catheter("straight-5f")
-    wide = replace(outer, diameter_mm=1.25)
-    with pytest.raises(InputError, match="catheter: 2; the search drives one"):
-        NavigationLoop(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent").run()
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,5 @@
 // Tests of the core's headers against their meaning: lane types against scalars, the block solver against a dense one,
-// gradients and Hessians against finite differences. Built with sanitizers and run by test_core_sanitized.py.
+// gradients and Hessians against finite differences. Built with sanitizers and run by test_core_cpp.py.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>

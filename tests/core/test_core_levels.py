@@ -1,4 +1,4 @@
-"""The core's builds for different processors: the same bits from all of them, and a choice that can be made by hand."""
+"""The core's builds for different processors: the same bits, a choice that can be made by hand, and its tables."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from pathlib import Path
 
 import navigations
 import pytest
+
+from endopilot import _core
 
 BASELINE = import_module("endopilot._core_baseline")
 SUPPORTED: list[str] = BASELINE.supported_levels()
@@ -90,3 +92,25 @@ def test_a_level_holds_its_own_instructions_and_no_fused_ones(level: str) -> Non
 def test_another_number_of_lanes_is_refused(lanes: int) -> None:
     with pytest.raises(ValueError, match=f"lanes: {lanes}; give 1, 4 or 8"):
         navigations.navigate("velocity", lanes)
+
+
+def test_a_run_records_what_the_table_of_outputs_lists() -> None:
+    recorded = navigations.navigate("velocity", 1)
+    each = (navigations.WORLDS, navigations.SAMPLES)
+    shapes = {"sample": each, "device": (*each, 1), "start": (navigations.WORLDS, 1)}
+    for name, of, numbers, _, meaning in _core.OUTPUTS:
+        assert meaning, name
+        if of == "element":  # which are not asked for
+            assert name not in recorded
+            continue
+        shape = shapes.get(of, (*each, recorded["contacts"].shape[1]))
+        assert recorded[name].shape == (shape if numbers == 1 else (*shape, numbers)), name
+    assert set(recorded) - {name for name, *_ in _core.OUTPUTS} == {"reason", "contacts"}
+
+
+def test_the_table_of_options_lists_the_settings() -> None:
+    options = _core.Options()
+    for name, kind, _, meaning in _core.OPTIONS:
+        setattr(options, name, 3)
+        assert meaning and type(getattr(options, name)).__name__ == kind, name
+    assert {name for name in dir(_core.Options) if not name.startswith("_")} == {name for name, *_ in _core.OPTIONS}

@@ -1,5 +1,5 @@
 // The GPU's path, run on the processor, against the scalar lanes of a processor's thread: the same numbers to the bit. Built
-// with sanitizers and run by test_core_sanitized.py; `cuda_runtime.h` is that of cuda_on_cpu.
+// with sanitizers and run by test_core_cpp.py; `cuda_runtime.h` is that of cuda_on_cpu.
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -164,27 +162,6 @@ def test_two_anatomies_of_one_name_are_refused(tmp_path):
     with pytest.raises(InputError, match="2 are named 'twin'"):
         make_toy_dataset(tmp_path / "d", patients=2, sequences=4)
     assert not (tmp_path / "d").exists()
-
-
-def test_a_full_disk_gives_one_line_and_the_run_can_be_resumed(tmp_path, monkeypatch):
-    settings = {"patients": 1, "sequences": 4, "sequences_per_file": 2}
-    make_toy_dataset(tmp_path / "whole", **settings)
-    write = Path.write_bytes
-
-    def full(path: Path, content: bytes) -> int:
-        # files are written by several threads, in no fixed order: it is this one that finds the disk full
-        if path.parent == tmp_path / "full/data/chunk-000" and path.name.endswith("file-001.parquet"):
-            write(path, content[: len(content) // 2])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(path, content)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(InputError, match="the disk is full; free some space and run the same command again"):
-        make_toy_dataset(tmp_path / "full", **settings)
-    assert not (tmp_path / "full/data/chunk-000/file-001.parquet").exists()
-    monkeypatch.undo()
-    make_toy_dataset(tmp_path / "full", **settings)
-    assert data_hashes(tmp_path / "full") == data_hashes(tmp_path / "whole")
 
 
 def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):

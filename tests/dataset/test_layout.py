@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.cli import main
 from endopilot.dataset.info import describe_dataset, draw_pictures
 from endopilot.dataset.layout import assign_splits
 from endopilot.dataset.loader import read_dataset, read_joined
@@ -157,13 +155,3 @@ def test_every_distribution_has_a_picture(folder, tmp_path):
     names = {"insertion", "offset-ratio", "wall-ratio", "contact-force", "branches", "manoeuvres"}
     assert {path.stem for path in paths} == names
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
-
-
-def test_the_command_prints_json_and_names_what_is_missing(folder, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        main(["dataset-info", str(folder), "--json"])
-    assert json.loads(capsys.readouterr().out)["navigations"] == 30
-    with pytest.raises(SystemExit) as leaving:
-        main(["dataset-info", str(tmp_path)])
-    assert leaving.value.code == 2
-    assert "no dataset here" in capsys.readouterr().err

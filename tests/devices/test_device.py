@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import endopilot
-from endopilot.cli import main
+from command import run
 from endopilot.devices.catheter import read_catheter, write_device
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.device_files import device_yaml, list_wires, user_devices
@@ -145,10 +144,7 @@ def test_a_variable_that_names_no_folder_is_refused(folders, monkeypatch):
 
 
 def test_the_command_lists_devices_with_their_origin(folders, capsys):
-    with pytest.raises(SystemExit) as leaving:
-        main(["devices", "--json"])
-    assert leaving.value.code == 0
-    rows = {row["name"]: row["origin"] for row in json.loads(capsys.readouterr().out)}
+    rows = {row["name"]: row["origin"] for row in run(capsys, "devices")}
     assert list(rows) == [*list_wires(), "mine", "ours"]
     assert rows["j-035"] == "endopilot" and rows["ours"] == str(folders[1] / "ours.yaml")
 

@@ -13,39 +13,14 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
-from command import refused, run
 from pydicom.datadict import DicomDictionary
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
+from command import refused, run
 from endopilot.anatomy.io import read_anatomy
-from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
-from endopilot.types import LumenMask, Volume
-
-_COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.2", "--margin-mm", "8")
-
-
-@pytest.fixture(scope="module")
-def enhanced(tmp_path_factory, right_artery) -> Path:
-    """Return a folder of DICOM slices of a synthetic CT angiogram."""
-    from endopilot.cli import main
-
-    folder = tmp_path_factory.mktemp("phantom") / "ct"
-    with pytest.raises(SystemExit) as leaving:
-        main(["phantom", str(right_artery), "-o", f"{folder}/", *_COARSE])
-    assert leaving.value.code == 0
-    return folder
-
-
-def test_a_phantom_as_dicom_is_that_as_nifti(enhanced, right_artery, tmp_path, capsys):
-    """Bit for bit in HU, and within 1e-4 mm in place."""
-    run(capsys, "phantom", right_artery, "-o", tmp_path / "ct.nrrd", *_COARSE)
-    dicom, other = read_volume(enhanced), read_volume(tmp_path / "ct.nrrd")
-    assert dicom.voxels.dtype == other.voxels.dtype == np.int16
-    np.testing.assert_array_equal(dicom.voxels, other.voxels)
-    corner = np.array(other.voxels.shape[::-1], dtype=float)
-    for index in (np.zeros(3), corner, corner * [1, 0, 0]):
-        np.testing.assert_allclose(dicom.index_to_world(index), other.index_to_world(index), atol=1e-4)
+from endopilot.imaging.volume import read_mask, write_volume
+from endopilot.types import Volume
 
 
 def _changed(source: Path, target: Path, every: int = 1, **values) -> Path:
@@ -83,20 +58,6 @@ def test_a_straightened_ct_is_told_by_every_command(right_artery, tmp_path, caps
     assert figures["notes"][0].startswith(note)
     assert read_mask(tmp_path / "run" / "masks" / "patient.nii.gz").warnings[0].startswith(note)
     assert read_anatomy(tmp_path / "run" / "anatomies" / "patient").provenance["notes"][1].startswith(note)
-
-
-def test_a_mask_made_elsewhere_becomes_an_anatomy(tmp_path, capsys):
-    """Of DICOM-SEG, without the file beside it; the ostium is given later."""
-    pytest.importorskip("highdicom", reason="DICOM-SEG needs highdicom (the extra dicom-seg)")
-    voxels = np.zeros((40, 20, 20), dtype=bool)
-    voxels[2:38, 7:13, 7:13] = True
-    mask = LumenMask(Volume(voxels, np.array([0.5, 0.5, 1.0]), np.array([5.0, -9.0, 700.0]), np.eye(3)))
-    write_mask(mask, tmp_path / "c.dcm", manifest={})
-    (tmp_path / "c.json").unlink()
-    start = ("--ostium-mm", "10", "-4", "702")
-    figures = run(capsys, "anatomy", tmp_path / "c.dcm", "-o", tmp_path / "c-anatomy", *start)
-    assert 28 < figures["longest_path_mm"] < 40
-    np.testing.assert_allclose(figures["ostium_lps_mm"], [10.0, -4.0, 702.5], atol=1.5)
 
 
 _MARKED = {

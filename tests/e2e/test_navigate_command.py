@@ -9,8 +9,8 @@ from unittest.mock import patch
 import numpy as np
 import pandas as pd
 import pytest
-from command import refused, run
 
+from command import refused, run
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli import main
 from endopilot.control.navigate import NavigateConfig, navigate
@@ -279,22 +279,6 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
     assert sorted(path.name for path in output.iterdir()) == FILES
     page = (output / "navigation.html").read_text(encoding="utf-8")
     assert again["exposures"] == 1 and "Wires held possible" not in page
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--target", "LADX"), "has no such section (it has 1, 2, 3, 4"),
-        (("--target", "1", "--policy", "none"), "policy: 'none'"),
-        (("--target", "1", "--device", "none"), "device 'none'"),
-        (("--target", "1", "--world", "none"), "world 'none'"),
-        (("--target", "1", "--tip", "10000/1"), "cannot be given to workhorse-014"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(patient, capsys, tmp_path, arguments, message):
-    line = refused(capsys, "navigate", patient, "-o", tmp_path / "out", *arguments)
-    assert message in line
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):

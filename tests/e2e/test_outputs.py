@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import refused, run
 
+from command import refused, run
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.volume import write_mask
@@ -58,18 +58,6 @@ def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, p
     assert "lies in the output" in refused(capsys, "navigate", patient, "--target", "M1", "-o", patient)
     shutil.rmtree(inner)
     assert content(mask.parent) == before
-
-
-@pytest.mark.parametrize("words", ["anatomy MASK", "anatomy MASK MASK2", "plan PATIENT --target M1"])
-def test_a_folder_of_other_things_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path, words):
-    names = {"MASK": mask, "MASK2": straight_mask(tmp_path / "more" / "n.nrrd", 5.0), "PATIENT": patient}
-
-    theirs = tmp_path / "theirs"
-    theirs.mkdir()
-    (theirs / "manifest.json").write_text("{}")
-    line = refused(capsys, *(names.get(word, word) for word in words.split()), "-o", theirs)
-    assert "is not empty and holds no run.json" in line
-    assert content(theirs) == {"manifest.json": b"{}"}
 
 
 def test_a_finished_anatomy_is_made_again_from_the_same_mask_alone(mask, capsys, tmp_path):

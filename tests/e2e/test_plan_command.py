@@ -3,31 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from command import refused, run
-
-from endopilot.anatomy.io import write_anatomy
-from endopilot.types import Insertion
-
-
-def test_a_plan_is_written_whole_and_driven_where_it_was_made_and_nowhere_else(fork, vessel, tmp_path, capsys):
-    planned = run(capsys, "plan", vessel, "--target", "0,0,33", "-o", tmp_path / "plan")
-    assert planned["reached"] and planned["tip_error_mm"] <= 2.0 and planned["peak_force_n"] < 0.5
-    table = ("--controls", tmp_path / "plan" / "plan.csv", "-o", tmp_path / "by-table.csv")
-    assert run(capsys, "simulate", vessel, *table)["valid_worlds"] == 1
-    drive = ("--controls", tmp_path / "plan", "-o", tmp_path / "again.csv")
-    again = run(capsys, "simulate", vessel, *drive)
-    assert again["samples"] == 2 * planned["seconds"] and again["deepest_tip_mm"] == pytest.approx(33.0, abs=2.0)
-    (tmp_path / "again.csv").unlink()
-    write_anatomy(
-        replace(fork, insertion=Insertion(np.zeros(3), np.array([0.1, 0.0, 0.995]))), output=tmp_path / "other"
-    )
-    assert "another anatomy" in refused(capsys, "simulate", tmp_path / "other", *drive)
-    assert "another device" in refused(capsys, "simulate", vessel, *drive, "--device", "wire-018")
-    assert not (tmp_path / "again.csv").exists()
 
 
 def test_xray_is_foreseen_along_a_plan(vessel, tmp_path, capsys):

@@ -8,9 +8,9 @@ from unittest.mock import patch
 import numpy as np
 import pandas as pd
 import pytest
-from command import run
 from scipy.ndimage import binary_dilation
 
+from command import run
 from endopilot.imaging.volume import read_volume
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -48,7 +48,7 @@ def test_the_agent_drives_a_j_wire_over_the_arch_of_a_real_cta(tmp_path, capsys)
         *("--reference", CTA / "seg_aorta.nii.gz", "--picture", tmp_path / "mask.png"),
     )
     assert agreement["dice"] > 0.84
-    assert agreement["share_inside_reference"] > 0.9
+    assert agreement["share_inside_reference"] > 0.92
     assert (tmp_path / "mask.png").stat().st_size > 100_000
     run(capsys, "anatomy", mask, "-o", tmp_path / "aorta", "--vessel", "generic")
     driven = run(

@@ -11,11 +11,11 @@ import time
 from functools import partial
 from pathlib import Path
 
-import command
 import numpy as np
 import pydicom
 import pytest
 
+import command
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
@@ -81,14 +81,6 @@ def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys,
     assert command.run(capsys, *line) == found
     assert "has no such section" in command.refused(capsys, *arguments(case), "--target", "LADX")
     assert {path: path.stat().st_mtime_ns for path in case.rglob("*")} == written
-
-
-def test_another_patient_is_refused_though_the_file_s_name_is_the_same(case, tmp_path, capsys):
-    before = {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")}
-    write_volume(tiny_ct(2), tmp_path / "ct.nii.gz")
-    line = command.refused(capsys, *arguments(case, tmp_path / "ct.nii.gz"))
-    assert f"{case / 'run'}: was begun with volume_sha256 = " in line
-    assert {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")} == before
 
 
 def test_another_series_is_refused(tmp_path, capsys):

@@ -157,9 +157,12 @@ def test_a_segmentation_without_layers_has_a_segment_in_each(tmp_path):
     np.testing.assert_array_equal(read_mask(alone).volume.voxels, _B)  # the only one that holds voxels
 
 
-def test_two_segments_of_one_name_are_told_apart_by_number(tmp_path):
+def test_two_segments_of_one_name_are_told_apart_by_number_and_odd_numbers_refused(tmp_path):
     with pytest.raises(InputError, match="2 segments are called v; choose one by number"):
         read_mask(_slicer(tmp_path / "seg.nrrd", [_A * 1, _B * 2], [("v", 0, 1), ("v", 1, 2)]), label="v")
+    for layer, value in ((0, "x"), ("1.5", 1)):
+        with pytest.raises(InputError, match="Segment0 has no whole numbers as LabelValue and Layer"):
+            read_mask(_slicer(tmp_path / "odd.nrrd", [_A * 1], [("v", layer, value)]))
 
 
 def _dicom_seg(path, layers, kind="BINARY", **options):

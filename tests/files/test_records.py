@@ -62,21 +62,6 @@ def test_a_manifest_that_is_none(tmp_path, content) -> None:
     refused(tmp_path, lambda: read_manifest(tmp_path))
 
 
-@pytest.mark.parametrize("odd", ODD, ids=repr)
-def test_a_dataset_whose_manifest_or_info_holds_something_else(tmp_path, odd) -> None:
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "manifest.json").write_text(json.dumps({"key": "k", "settings": odd}))
-    refused(tmp_path, lambda: read_manifest(tmp_path))
-
-
-def test_weights_that_are_none(tmp_path, a_run) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(a_run, run)
-    for content in (b"", b"\x00" * 100, (run / "ff.safetensors").read_bytes()[:5000]):
-        (run / "ff.safetensors").write_bytes(content)
-        assert "train it again" in refused(run, lambda: load_model(run))
-
-
 def test_stages_and_settings_that_are_none(tmp_path) -> None:
     (tmp_path / "stages.json").write_text("[1]")
     refused(tmp_path, lambda: Stages(tmp_path))

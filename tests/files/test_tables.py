@@ -213,9 +213,3 @@ def outcome(path: Path, content: str | bytes, devices: int = 1) -> ScriptedContr
 )
 def test_any_cells(tmp_path, header, rows, separator, end, devices) -> None:
     outcome(tmp_path / "c.csv", end.join(separator.join(row) for row in (header, *rows)), devices)
-
-
-@BOUNDED
-@given(content=st.binary(max_size=80) | st.text(max_size=80))
-def test_any_bytes(tmp_path, content) -> None:
-    assert outcome(tmp_path / "c.csv", content) is None

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import pandas as pd
 import pytest
 from PIL import Image
 
 from benchmarks.robot.synthetic import PERIOD_S, drawn, logged
-from endopilot.cli import main
+from command import run
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
 from endopilot.files import read_json
@@ -27,13 +25,6 @@ def log_file(fork, wire, tmp_path_factory):
         table.loc[::2, name] = (place[k].diff().fillna(place[k].transform("first")) / PERIOD_S).to_numpy()
     table.to_csv(path, index=False)
     return path
-
-
-def run(capsys, *arguments):
-    with pytest.raises(SystemExit) as leaving:
-        main([*map(str, arguments), "--json"])
-    assert leaving.value.code == 0
-    return json.loads(capsys.readouterr().out)
 
 
 def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, capsys) -> None:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
-import matplotlib.image
 import numpy as np
 import pytest
 
-from endopilot.anatomy.io import write_anatomy
-from endopilot.cli import main
 from endopilot.errors import InputError, Remark
 from endopilot.types import Volume
 from endopilot.xray.image import XrayImager
@@ -58,32 +54,6 @@ def test_a_ct_of_another_place_is_refused_with_both_boxes(fork, shift_mm):
         XrayImager(fork, "workhorse-014", ct=replace(there, origin_mm=low + shift_mm))
     with pytest.warns(Remark, match=r"[1-4]?\d% of the vessel"):
         XrayImager(fork, "workhorse-014", ct=replace(there, voxels=voxels[3:], origin_mm=low + np.array([0, 0, 8.5])))
-
-
-def test_the_command_writes_the_image(fork, tmp_path, capsys):
-    write_anatomy(fork, output=tmp_path / "fork")
-    path = tmp_path / "image.png"
-    with pytest.raises(SystemExit) as left:
-        main(
-            [
-                "xray",
-                str(tmp_path / "fork"),
-                "-o",
-                str(path),
-                "--view-deg",
-                "0",
-                "0",
-                "--inserted-length-mm",
-                "12",
-                "--json",
-            ]
-        )
-    assert left.value.code == 0
-    figures = json.loads(capsys.readouterr().out)
-    image = shown(fork)
-    np.testing.assert_allclose(figures["tip_row_column"], image.tip_pixel, atol=0.02)
-    grey = np.rint(255 * matplotlib.image.imread(path))
-    np.testing.assert_array_equal(grey, image.grey)
 
 
 def test_a_breath_moves_vessel_and_wire_in_the_image(fork):
