@@ -12,6 +12,10 @@ demo: $(INSTALLED)
 # Written bytecode spares the processes that tests start from compiling the package, each by itself. Memory that arrays
 # leave stays with the process (glibc): getting it anew, page by page, takes up to a fifth of the time of a segmentation.
 KEEPING := MALLOC_MMAP_THRESHOLD_=268435456 MALLOC_TRIM_THRESHOLD_=1073741824
+# Vessels, and what is driven in them, differ in their last bits by the kernels of numpy: those of AVX2 are everywhere.
+ifeq ($(shell uname -m),x86_64)
+KEEPING += OPENBLAS_CORETYPE=Haswell NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR"
+endif
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(KEEPING) PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 

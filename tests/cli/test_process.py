@@ -251,7 +251,7 @@ def test_odd_names_are_shown_as_they_are(capsys, name):
     ("text", "said"),
     [
         ("--nonesuch", "unrecognized arguments: --nonesuch"),
-        ("--sequences x", "--sequences"),
+        ("--sequences x", "sequences: 'x'; give a whole number from 1"),
         ("", "Missing"),
         ("--motion-seed -1", "motion_seed: -1; give a whole number from 0"),
     ],

@@ -74,11 +74,11 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
 
 def test_the_agent_arrives_though_encoders_sit_in_front_of_a_wide_play(side_branch, with_play) -> None:
     config = LoopConfig(robot=with_play)
-    record = NavigationLoop(side_branch, AgentPolicy(QUICK), config=config, seed=2).run()
+    record = NavigationLoop(side_branch, AgentPolicy(QUICK), config=config, seed=4).run()
     assert record.success and record.safe and record.faults == 0
     assert record.exposures <= 13  # exposures may follow each other after 1 s
     unaware = replace(side_branch, robot=RobotConfig())  # what it is given of the robot
-    blind = NavigationLoop(unaware, AgentPolicy(QUICK), config=config, seed=2).run()
+    blind = NavigationLoop(unaware, AgentPolicy(QUICK), config=config, seed=4).run()
     assert not blind.success or blind.exposures > 2 * record.exposures
 
 

@@ -26,6 +26,7 @@ from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory import SimulationSetUp
 
 DEVICE = read_wire("workhorse-014")
 
@@ -36,7 +37,7 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
     generate_dataset([patient], output=tmp_path / "dataset", device=DEVICE, config=config)
     data = read_dataset(tmp_path / "dataset")
     assert data.valid.all()
-    assert set(data.device) == {DEVICE.name}
+    assert data.stack.wire.name == DEVICE.name
     assert (data.anatomy_folder(str(data.anatomy[0]))) == patient.resolve()
     assert np.ptp(data.tip_abscissa, axis=1).max() > 1
     tips = list(zip(data.tip_bend.tolist(), data.tip_stiffness_factor.tolist(), strict=True))

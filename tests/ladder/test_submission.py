@@ -259,7 +259,7 @@ def looking(tmp_path_factory) -> dict:
     ("forge", "said"),
     [
         (_made_up, "seconds is 0.5 in the file and "),
-        (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell, numpy X86_V3 or with openblas Sk"),
+        (_of_mkl, "blas: mkl; submissions are driven again with openblas Haswell, numpy X86_V3 or with openblas Ha"),
         (_of_another_kernel, None),  # or this machine lacks the kernel
         (_without_exposures, "retract-rotate decides otherwise"),
         (_of_a_better_hand, "retract-rotate decides otherwise"),

@@ -40,6 +40,7 @@ KERNELS = {
         "avx2",
         {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"},
     ),
+    "openblas Haswell, numpy X86_V4": ("avx512", {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": ""}),
     "openblas SkylakeX, numpy X86_V4": ("avx512", {"OPENBLAS_CORETYPE": "SkylakeX", "NPY_DISABLE_CPU_FEATURES": ""}),
 }
 """Kernels of linear algebra and of numpy's functions that submissions are driven again with, the processor level that
