@@ -33,6 +33,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _STATE_FORMAT = 4  # of `SimulatorState`: raised when its values come to mean something else
+_PACK = 8  # worlds that count as stepped together, however many the processor steps: a budget buys the same on each
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 _AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds, but not the main thread's: Ctrl-C stops a step there
 
@@ -285,8 +286,8 @@ class Simulator(Readout):
             True
         """
         of = [step.node_iterations[group.index] for group in self._groups]
-        packs = [max(-(-len(each) // LANES) * each.mean(), each.max()) for each in of]
-        return float(self._devices * LANES * sum(packs))
+        packs = [max(-(-len(each) // _PACK) * each.mean(), each.max()) for each in of]
+        return float(self._devices * _PACK * sum(packs))
 
     @property
     def state(self) -> SimulatorState:
