@@ -180,9 +180,11 @@ class DriveMotion:
         robots = len(position)
         self._fastest = np.array([[each.fastest for each in of_robot] for of_robot in limits])
         self._travel = np.moveaxis(np.array([[each.travel_mm for each in of_robot] for of_robot in limits]), -1, 0)
-        self._latency_s, self._jitter_s, self._clock = np.zeros((3, robots))
-        self._acceleration, self._gain, self._half_play, self._ahead = np.zeros((4, *position.shape))
-        self._wanted, self._ramp, self.velocity, self.motor, self.position = np.zeros((5, *position.shape))
+        self._latency_s, self._jitter_s, self._clock = (np.zeros(robots) for _ in range(3))
+        self._acceleration, self._gain, self._half_play, self._ahead = (np.zeros(position.shape) for _ in range(4))
+        self._wanted, self._ramp, self.velocity, self.motor, self.position = (
+            np.zeros(position.shape) for _ in range(5)
+        )
         self._random: list[np.random.Generator] = [np.random.default_rng()] * robots
         self._orders: deque[tuple[Float[np.ndarray, "robots"], Float[np.ndarray, "robots devices 2"]]] = deque()
         self.reset(range(robots), position, seeds, [config] * robots if isinstance(config, RobotConfig) else config)

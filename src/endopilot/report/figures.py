@@ -234,7 +234,7 @@ def _style(series: str) -> dict[str, Any]:
 
 def _upper(table: pd.DataFrame, column: str) -> float:
     """Return an upper limit that shows every series whole, unless one runs away from all others."""
-    series = [float(line[column].max()) for line in _groups(table, "series").values()]
+    series = [float(line[column].to_numpy().max()) for line in _groups(table, "series").values()]
     highest = sorted(value for value in series if np.isfinite(value))
     if not highest:
         return 1.0
