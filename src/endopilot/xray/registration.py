@@ -243,7 +243,6 @@ def _fit(
             slope,
             bounds=sought.bounds,
             x_scale=sought.sd,
-            loss="soft_l1",
             max_nfev=10,
             xtol=1e-4,
             ftol=1e-4,
@@ -300,14 +299,21 @@ class _Comparison:
         return (shares @ flat).reshape(theirs.shape), theirs, max(float(shares @ [1.0, along.mean()]), _WEAKEST)
 
     def residuals(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n"]:
-        """Return how the images differ from what is expected, in units of the usual misfit, and the prior's terms."""
+        """Return how the images differ from what is expected, and the prior's terms: what counts alike is alike."""
         full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
-        images = [
-            ((ours - theirs) / (strength * full)).ravel()
-            for moment in self.fitted(sought)
-            for ours, theirs, strength in moment
-        ]
-        return np.concatenate([*images, (sought - self.sought.laid) / self.sought.sd])
+        misfit = np.concatenate(
+            [
+                ((ours - theirs) / (strength * full)).ravel()
+                for moment in self.fitted(sought)
+                for ours, theirs, strength in moment
+            ]
+        )
+        less = np.sign(misfit) * np.sqrt(2 * (np.sqrt(1 + misfit**2) - 1))  # the soft L1 loss
+        return np.concatenate([less / self._together(), (sought - self.sought.laid) / self.sought.sd])
+
+    def _together(self) -> float:
+        """Return how many times less a pixel says: a Gaussian blur averages 4π times its square, which err together."""
+        return np.sqrt(4 * np.pi) * self.blur
 
     def slope(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n k"]:
         """Return the derivative of the residuals by what is sought."""
@@ -316,13 +322,10 @@ class _Comparison:
         return np.stack(columns, axis=-1)
 
     def covariance(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
-        """Return the covariance of what fits: what the pixels leave open, with the prior.
-
-        Neighbouring pixels that were blurred together err together; the misfit is that near the vessel.
-        """
+        """Return the covariance of what fits: what the pixels leave open, with the prior."""
         slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
-        misfit = float(np.sqrt(np.mean(residual[near] ** 2) * 4 * np.pi)) * self.blur
+        misfit = float(np.sqrt(np.mean(residual[near] ** 2))) * self._together()
         return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
