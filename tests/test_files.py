@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endopilot import __version__
 from endopilot.errors import InputError
 from endopilot.files import input_hash, manifest, read_json, sha256, write_json, writing
 from endopilot.runs import claim, make_missing
@@ -88,6 +89,7 @@ def test_the_same_run_may_go_on_and_its_record_stays(tmp_path):
     assert (folder / "run.json").stat().st_mtime_ns == before
     assert read_json(folder / "run.json") == {
         "command": "endopilot test", "config": {"seed": 1, "shares": [0.5, 0.5]}, "input": "a", "at": 2.0,
+        "version": __version__,
     }  # fmt: skip
 
 
