@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from endopilot import __version__
 from endopilot.errors import InputError
-from endopilot.files import input_hash, manifest, read_json, sha256, write_json, writing
+from endopilot.files import input_hash, manifest, read_json, sha256, stored_arrays, write_json, writing
 from endopilot.runs import claim, make_missing
 
 
@@ -74,6 +75,21 @@ def test_the_hash_of_a_folder_sees_every_file(tmp_path: Path) -> None:
 class Settings:
     seed: int = 1
     shares: tuple[float, float] = (0.5, 0.5)
+
+
+def test_arrays_that_are_damaged_anywhere_are_one_line(tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(1000, size=200)
+    np.savez_compressed(tmp_path / "whole.npz", numbers=numbers)
+    whole, damaged = (tmp_path / "whole.npz").read_bytes(), 0
+    for at in range(0, len(whole) - 20, 5):
+        (tmp_path / "bad.npz").write_bytes(whole[:at] + bytes(20) + whole[at + 20 :])
+        try:
+            with stored_arrays(tmp_path / "bad.npz", "numbers", "write them again") as stored:
+                stored["numbers"].sum()
+        except InputError as error:
+            assert re.search(r"bad\.npz: no numbers \(.*\); write them again$", str(error))
+            damaged += 1
+    assert damaged > 20
 
 
 def begin(folder: Path, **identity) -> None:
