@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
@@ -47,7 +46,7 @@ def bench_dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: A
     """
     size = DatasetConfig().sequences_per_file
     count = max(1, round(share * PAPER_ANATOMIES * PAPER_SEQUENCES / size))
-    claim(output, "python -m benchmarks dataset", share=share, version=__version__)
+    claim(output, "python -m benchmarks dataset", share=share)
     folders = [output / "anatomies" / f"rca-{index:04d}" for index in range(count)]
     with progress("Synthetic patients", count) as advance:
         for index, folder in enumerate(folders):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import errno
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from endopilot import __version__
 from endopilot.errors import InputError
-from endopilot.files import input_hash, manifest, read_json, sha256, write_json, writing
+from endopilot.files import input_hash, manifest, read_json, sha256, stored_arrays, write_json, writing
 from endopilot.runs import claim, make_missing
 
 
@@ -75,6 +77,21 @@ class Settings:
     shares: tuple[float, float] = (0.5, 0.5)
 
 
+def test_arrays_that_are_damaged_anywhere_are_one_line(tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(1000, size=200)
+    np.savez_compressed(tmp_path / "whole.npz", numbers=numbers)
+    whole, damaged = (tmp_path / "whole.npz").read_bytes(), 0
+    for at in range(0, len(whole) - 20, 5):
+        (tmp_path / "bad.npz").write_bytes(whole[:at] + bytes(20) + whole[at + 20 :])
+        try:
+            with stored_arrays(tmp_path / "bad.npz", "numbers", "write them again") as stored:
+                stored["numbers"].sum()
+        except InputError as error:
+            assert re.search(r"bad\.npz: no numbers \(.*\); write them again$", str(error))
+            damaged += 1
+    assert damaged > 20
+
+
 def begin(folder: Path, **identity) -> None:
     claim(folder, "endopilot test", **({"config": Settings(), "input": "a", "at": np.float64(2)} | identity))
 
@@ -88,6 +105,7 @@ def test_the_same_run_may_go_on_and_its_record_stays(tmp_path):
     assert (folder / "run.json").stat().st_mtime_ns == before
     assert read_json(folder / "run.json") == {
         "command": "endopilot test", "config": {"seed": 1, "shares": [0.5, 0.5]}, "input": "a", "at": 2.0,
+        "version": __version__,
     }  # fmt: skip
 
 

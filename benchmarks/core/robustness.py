@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks.core.manoeuvres import MANOEUVRES, paired_controls, seed_of, stacks_of
 from benchmarks.figures import Bar
-from endopilot import __version__, _core
+from endopilot import _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
@@ -274,7 +274,6 @@ def _identity(config: RobustnessConfig) -> dict[str, Any]:
         "devices": {device.name: device for device in devices},
         "catheters": {catheter.name: catheter for catheter in catheters},
         "core_sha256": sha256(Path(_core.__file__)),
-        "version": __version__,
     }
 
 

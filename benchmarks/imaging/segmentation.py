@@ -18,7 +18,6 @@ import endopilot.imaging
 import endopilot.phantom
 from benchmarks.figures import Bar
 from benchmarks.imaging.cases import Difficulty, draw_case
-from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.atlas.atlas import make_patient
 from endopilot.errors import InputError
@@ -159,4 +158,4 @@ def _identity(seed: int) -> dict[str, Any]:
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
         sources[package.__name__] = digest.hexdigest()
-    return {"seed": seed, "sources": sources, "version": __version__}
+    return {"seed": seed, "sources": sources}

@@ -22,6 +22,7 @@ from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import yaml
@@ -249,6 +250,17 @@ def reading(path: Path, mend: str) -> Iterator[None]:
         raise InputError(
             f"{path}: damaged ({str(error).splitlines()[0] if str(error) else error!r}); {mend}"
         ) from error
+
+
+@contextmanager
+def stored_arrays(path: Path | str, what: str, mend: str) -> Iterator[Any]:
+    """Open an .npz file; InputError if it is missing or damaged, or `what` the block takes out of it is not there."""
+    odd = (OSError, ValueError, KeyError, AttributeError, TypeError)
+    try:
+        with np.load(regular(path), allow_pickle=False) as stored:
+            yield stored
+    except (*odd, BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+        raise InputError(f"{path}: no {what} ({error}); {mend}") from None
 
 
 def sha256(path: Path) -> str:

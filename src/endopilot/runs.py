@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from endopilot import __version__
 from endopilot.errors import InputError
 from endopilot.files import PARTIAL, RECORD_FILE, is_empty, json_text, read_json, regular, write_json
 from endopilot.parallel import Workers, each
@@ -56,12 +57,14 @@ def existing(path: Path) -> Path:
 def claim(folder: Path, command: str, **identity: Any) -> None:
     """Claim a folder for a run, or check that the run that began in it is the same one; InputError if it is not.
 
-    The first run writes `run.json`: the command, and everything that its results follow from; a later one may go on
-    only where all that is equal. What a killed run left half-written is removed; a folder of `run.json` alone goes to
-    the new run. `identity` is by name: dataclasses, paths and numpy values are understood.
+    The first run writes `run.json`: the command, everything that its results follow from, and the version of the
+    package unless `identity` has one; a later one may go on only where all that is equal. What a killed run left
+    half-written is removed; a folder of `run.json` alone goes to the new run. `identity` is by name: dataclasses, paths
+    and numpy values are understood.
     """
     folder = Path(folder)
-    now = json.loads(json_text({"command": command} | identity))  # as a file gives it back, so that it compares equal
+    now = {"command": command, **identity, "version": identity.get("version", __version__)}
+    now = json.loads(json_text(now))  # as a file gives it back, so that it compares equal
     record = folder / RECORD_FILE
     if record.exists():
         before = read_json(record)

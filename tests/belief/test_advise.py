@@ -13,8 +13,7 @@ import pytest
 from endopilot.anatomy.io import write_anatomy
 from endopilot.belief import monitoring
 from endopilot.belief.advise import advise
-from endopilot.belief.adviser import AdviserConfig, Predicted
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration, Predicted
 from endopilot.belief.events import Counted
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.monitoring import AdviseConfig, Followed, Patient

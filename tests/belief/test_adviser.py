@@ -7,8 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig, Predicted
-from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
+from endopilot.belief.bands import (
+    AdviserConfig,
+    Calibration,
+    Predicted,
+    conformal_scale,
+    fit_spread,
+    narrowest,
+    spread_of,
+    surely_missed,
+)
 from endopilot.belief.events import astray_mm, count_events
 from endopilot.belief.watch import Watch
 from endopilot.control.agent_config import read_agent_calibration

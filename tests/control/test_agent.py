@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.belief.adviser import AdviserConfig
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration
 from endopilot.belief.watch import MISMATCH
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy, OraclePolicy
 from endopilot.control.agent_config import CALIBRATIONS, read_agent_calibration

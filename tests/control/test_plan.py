@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control import network_plan
 from endopilot.control.plan import plan, read_tips, within_limits
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
@@ -105,7 +104,7 @@ class Toy:
 def test_the_inverse_network_of_the_wire_is_asked_for_the_desired_tips(found, vessel, tmp_path, monkeypatch):
     record = {"config": {}, "networks": {}, "patients": [], "device": asdict(found.navigation.device)}
     write_json(tmp_path / "run" / "manifest.json", record)
-    monkeypatch.setattr(network_plan, "load_model", lambda _: Toy())
+    monkeypatch.setattr("endopilot.models.checkpoint.load_model", lambda _: Toy())
     inverse, run = PlanConfig(method="inverse", seconds=30.0), tmp_path / "run"
     made = plan(vessel, "0,0,33", config=inverse, model=run)
     desired = made.trajectory.columns["desired"][0]

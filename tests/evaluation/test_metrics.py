@@ -90,7 +90,7 @@ def test_results_read_back_as_written(results, tmp_path):
     np.testing.assert_array_equal(after.tip_distance["P4"], before.tip_distance["P4"])
     json.dumps(summarize(after, seed=0), allow_nan=False)
     (tmp_path / "evaluation.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match=r"evaluation\.npz: damaged"):
+    with pytest.raises(InputError, match=r"evaluation\.npz: no evaluation"):
         read_results(tmp_path / "evaluation.npz")
 
 

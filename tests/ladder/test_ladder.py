@@ -80,7 +80,7 @@ def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp
     ],
 )
 def test_a_folder_of_another_task_wire_or_version_is_refused(climbed, monkeypatch, name, changed, message):
-    monkeypatch.setattr(terms, name, changed, raising=False)
+    monkeypatch.setattr(runs if name == "__version__" else terms, name, changed, raising=False)
     version = 1 if name == "NOTHING" else 2
     with pytest.raises(InputError, match=f"was begun with {message}"):
         climb(output=climbed[0], config=replace(ONE, version=version))

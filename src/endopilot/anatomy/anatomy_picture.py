@@ -23,6 +23,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.anatomy.wall_mesh import wall_mesh
 from endopilot.files import writing
+from endopilot.lines import places_on
 from endopilot.plotting import plain_text, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
 
@@ -98,7 +99,7 @@ def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: 
     count = max(2, int(line.abscissa[-1] / 0.2))
     at = np.linspace(0.0, float(line.abscissa[-1]), count)
     points, normals, directions = (
-        _along(line, values, at) for values in (line.points, line.normals, tangents(line.points))
+        places_on(values, line.abscissa, at) for values in (line.points, line.normals, tangents(line.points))
     )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     across = np.linspace(-half, half, 81)
@@ -120,7 +121,7 @@ def _draw_sections(anatomy: Anatomy, line: Centerline, half: float, volume: Volu
     across = np.linspace(-half, half, 81)
     for axes, place in zip(figure.subplots(1, SECTIONS), places, strict=True):
         centre, normal, tangent = (
-            _along(line, values, np.array([place]))[0] for values in (line.points, line.normals, direction)
+            places_on(values, line.abscissa, np.array([place]))[0] for values in (line.points, line.normals, direction)
         )
         binormal = np.cross(tangent, normal)
         grid = centre + across[None, :, None] * normal + across[:, None, None] * binormal
@@ -149,7 +150,3 @@ def _show(
         axes.imshow(hu, extent=extent, origin="lower", cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], aspect="auto")
     if distance.min() < 0 < distance.max():
         axes.contour(distance, [0.0], extent=extent, origin="lower", colors="lime", linewidths=0.9)
-
-
-def _along(line: Centerline, values: Float[np.ndarray, "n d"], at: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m d"]:
-    return np.stack([np.interp(at, line.abscissa, values[:, axis]) for axis in range(values.shape[1])], axis=1)

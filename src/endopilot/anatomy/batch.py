@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from endopilot import __version__, files
+from endopilot import files
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import write_anatomy
 from endopilot.errors import InputError
@@ -33,7 +33,7 @@ def extract_all(
         raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
     folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
     reading = {"label": label, "threshold": threshold}
-    with claiming(output, "endopilot anatomy", sources=list(folders), **reading, config=config, version=__version__):
+    with claiming(output, "endopilot anatomy", sources=list(folders), **reading, config=config):
         bad = each("Anatomies", list(folders), partial(_make, folders=folders, reading=reading, config=config))
         rejected = {str(source): str(bad[source]) for source in folders if source in bad}
         if len(rejected) == len(folders):
@@ -49,7 +49,7 @@ def claim_anatomy(
 ) -> AbstractContextManager[None]:
     """Return the claim of a folder by the anatomy of a source that was read so, see `runs.claiming`."""
     made_from = {"source": content.sha256, "name": name, "config": config}
-    return claiming(folder, "endopilot anatomy", **made_from, **reading, version=__version__)
+    return claiming(folder, "endopilot anatomy", **made_from, **reading)
 
 
 def _make(source: Path, *, folders: dict[Path, Path], reading: dict[str, Any], config: AnatomyConfig) -> None:

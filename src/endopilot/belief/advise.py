@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from endopilot import __version__
 from endopilot.belief import monitoring
 from endopilot.belief.bands import CALIBRATION_FILE, Calibration, check_enough
 from endopilot.belief.monitor import Monitor
@@ -64,7 +63,7 @@ def advise(
     others = [_other(run, folder, (fit, calibrating)) for folder in also_test]
     inputs = run_inputs(run) | {"dataset": data.manifest["key"]}
     inputs |= {"also_test": [other.manifest["key"] for other in others]}
-    claim(output, "endopilot advise", inputs=inputs, config=config, version=__version__)
+    claim(output, "endopilot advise", inputs=inputs, config=config)
     (fitted, left_out), (own, left_out_too) = (follow_all(part, model, config) for part in (fit, calibrating))
     bands = monitoring.calibrate(fitted, own, config.adviser.level, data.manifest["key"])
     onset, curve = monitoring.greatest_onset(

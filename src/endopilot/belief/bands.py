@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Real, Shaped
@@ -19,7 +19,8 @@ from scipy.optimize import nnls
 
 from endopilot.errors import InputError
 from endopilot.files import write_json
-from endopilot.settings import NonNegative, OpenShare, Seconds, Within, read_settings, settings
+from endopilot.settings import NonNegative, OpenShare, Positive, Seconds, Within, read_settings, settings
+from endopilot.tasks.navigation import SUCCESS_MM
 
 CALIBRATION_FILE = "xray.json"
 """Name of a calibration beside the run that it belongs to."""
@@ -28,6 +29,33 @@ TERMS = ("constant_mm", "per_s", "per_mm_of_travel", "per_own_spread")
 _Terms = Annotated[tuple[NonNegative, ...], Field(min_length=len(TERMS), max_length=len(TERMS))]
 Tips = Float[np.ndarray, "*n 2"]
 """(Δtip, γtip), mm, or something of each of them."""
+
+
+@settings
+class AdviserConfig:
+    """What X-ray must not miss, and how sure the bands are to be."""
+
+    level: OpenShare = 0.9
+    """Share of the intervals without X-ray in which the bands shall hold throughout."""
+    wall_ratio: Positive = 0.7
+    """τ: an event begins where γtip/(lumen radius − wire radius) reaches it; 1 is the wall."""
+    abscissa_mm: Positive = SUCCESS_MM
+    """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
+    missed: OpenShare = 0.05
+    """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must use."""
+
+
+class Predicted(NamedTuple):
+    """What a model predicts of one tip."""
+
+    proximal: Float[np.ndarray, "2"]
+    """Δ, mm, and φ, rad, of the wire."""
+    tip: Float[np.ndarray, "2"]
+    """Δtip and γtip, mm."""
+    spread: Float[np.ndarray, "2"]
+    """The model's estimate of its own error of these, a standard deviation, mm."""
+    radius_mm: float
+    """Of the lumen at that Δtip."""
 
 
 @settings

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from endopilot.belief.adviser import AdviserConfig, Predicted
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration, Predicted
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import ahead_of_valve_n
 from endopilot.belief.identification import BETTER, Explanation, Identified, explain

@@ -11,8 +11,15 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig
-from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
+from endopilot.belief.bands import (
+    AdviserConfig,
+    Calibration,
+    conformal_scale,
+    fit_spread,
+    narrowest,
+    spread_of,
+    surely_missed,
+)
 from endopilot.belief.events import Counted, astray_mm, count_events
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.network_monitor import NetworkMonitor

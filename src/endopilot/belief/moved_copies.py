@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.lines import places_on
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.types import Anatomy
@@ -46,11 +47,8 @@ def shifted(
     behind = np.array([-20.0, -10.0])
     abscissa = np.concatenate([behind, line.abscissa])
     points = np.concatenate([insertion.position + behind[:, None] * insertion.direction, line.points])
-    there, here = (
-        np.column_stack([np.interp(x, abscissa, axis) for axis in points.T])
-        for x in (abscissa_mm + along_mm, np.array([abscissa_mm]))
-    )
-    return there - here
+    here = places_on(points, abscissa, np.array([abscissa_mm]))
+    return places_on(points, abscissa, abscissa_mm + along_mm) - here
 
 
 _ROUNDS, _PERIODS = 4, 3

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.belief.adviser import AdviserConfig, Predicted
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration, Predicted
 from endopilot.belief.monitor import BelievedTip
 from endopilot.belief.watch import Watch
 from endopilot.devices.stack import Proximals

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig, Predicted
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration, Predicted
 from endopilot.devices.drive_limits import SLACK_WIDTHS, WIDE_MM
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 

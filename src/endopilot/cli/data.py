@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from endopilot import __version__
 from endopilot.cli.arguments import Answer, Figures
 from endopilot.dataset.config import DatasetConfig
 from endopilot.devices.robot import read_robot
@@ -68,7 +67,7 @@ def dataset_info_command(dataset: Existing, /, *, output: OutputFolder | None = 
 
     description = describe_dataset(dataset)
     if output is not None:
-        claim(output, "endopilot dataset-info", figures=description.figures, version=__version__)
+        claim(output, "endopilot dataset-info", figures=description.figures)
     pictures = [] if output is None else draw_pictures(description, output)
     return description.figures | ({"pictures": pictures} if pictures else {})
 

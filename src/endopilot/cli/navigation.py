@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Answer, Figures
 from endopilot.control.difficulty import arch_type, assess_difficulty
@@ -75,6 +74,6 @@ def plan_command(
     stack = Stack.of(device or "workhorse-014", *catheter) if device or catheter else None
     patient, asked = read_anatomy(anatomy), {"target": target, "device": stack, "config": config, "xray": xray}
     weights = run_inputs(model or WIRES)
-    with claiming(output, "endopilot plan", anatomy=patient.identity, model=weights, **asked, version=__version__):
+    with claiming(output, "endopilot plan", anatomy=patient.identity, model=weights, **asked):
         found = plan(patient, target, device=stack, model=model, config=config)
         return write_plan(found, output=output, xray=plan_xray(found) if xray else None)

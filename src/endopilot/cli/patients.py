@@ -6,7 +6,6 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from endopilot import __version__
 from endopilot.anatomy.batch import claim_anatomy, extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
@@ -157,8 +156,7 @@ def atlas_command(*, output: OutputFolder, config: AtlasConfig = AtlasConfig()) 
     rows = []
     with progress("Synthetic patients", config.count) as advance:
         for anatomy in make_atlas(config=config):
-            identity = {"patient": anatomy.identity, "version": __version__}
-            with claiming(output / anatomy.name, "endopilot atlas", **identity):
+            with claiming(output / anatomy.name, "endopilot atlas", patient=anatomy.identity):
                 write_anatomy(anatomy, output=output / anatomy.name)
             path = anatomy.tree.longest_path()
             rows.append(

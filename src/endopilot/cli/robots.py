@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
-from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Answer, Figures
 from endopilot.devices.catheter import write_device
@@ -51,7 +50,7 @@ def replay_command(
     patient, read = read_anatomy(anatomy), read_log(log, topics=topics)
     wire, drives = read_wire(device), read_robot(robot)
     inputs = input_hash(log) | input_hash(anatomy)
-    claim(output, "endopilot replay", inputs=inputs, device=wire, robot=drives, config=config, version=__version__)
+    claim(output, "endopilot replay", inputs=inputs, device=wire, robot=drives, config=config)
     found = replay_log([read], patient, Stack(wire), robot=drives, config=config)
     figures = summary(found)
     title = f"{read.name} beside {device}, robot {Path(robot).name}"

@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.belief.adviser import AdviserConfig
-from endopilot.belief.bands import Calibration
+from endopilot.belief.bands import AdviserConfig, Calibration
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.states import State
 from endopilot.belief.thought import Budget, Thought

@@ -22,13 +22,14 @@ from endopilot.devices.robot import IDEAL, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
-from endopilot.models.config import WIRES, read_run
+from endopilot.models.config import WINDOW, WIRES, read_run
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
 from endopilot.settings import from_record, public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.csv_file import read_columns
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.route import Route, check_passable
@@ -111,10 +112,7 @@ def _find(
 ) -> tuple[Controls | Steps, Steps]:
     """Return controls, and the tips that whatever found them predicts, mm."""
     if config.method == "inverse" and run is not None and desired is not None:
-        with extra_named(f"plan by {config.method}"):
-            from endopilot.control.network_plan import plan_by_networks  # torch is slow to import
-
-        return plan_by_networks(navigation, run, desired)
+        return _by_networks(navigation, run, desired)
     if config.method in ("inverse", "search") and desired is not None:
         return _track(navigation, desired)
     return _search(navigation, config, trial) if config.method == "search" else _by_policy(navigation, config)
@@ -200,6 +198,37 @@ def _check_kept(made: Plan) -> None:
             f"target: not reached on the path found to {goal}: in the rod core the tip ends {where}; give another seed "
             "or another tip"
         )
+
+
+def _by_networks(navigation: Navigation, run: Path, desired: Steps) -> tuple[Steps, Steps]:
+    """Return the controls (mm/s, rad/s) of a trained run for desired tips, and the tips that it predicts, mm.
+
+    The networks need 30 states before the first that they predict. A plan begins with a wire at rest, so 15 s of rest
+    come before it.
+
+    Raises:
+        InputError: the run is unfinished or damaged, or has not both networks.
+    """
+    with extra_named("plan by inverse"):
+        from endopilot.models.checkpoint import load_model  # torch is slow to import
+        from endopilot.models.episodes import Episodes
+
+    predictor, config = load_model(run), SimulatorConfig(threads=1)
+    simulator = Simulator(navigation.anatomy, navigation.device, config=config)
+    simulator.reset(inserted_length=navigation.start[:, 0], rotation=navigation.start[:, 1])
+    tip, rest = simulator.project(), np.zeros((1, WINDOW, 2))
+    at_rest = np.tile([tip.abscissa[0, 0], tip.offset[0, 0]], (1, WINDOW, 1))
+    episodes = Episodes.of_controls(
+        navigation.anatomy,
+        navigation.device,
+        initial=navigation.start[0],
+        control=np.concatenate([rest, np.zeros((1, *desired.shape))], axis=1),
+        tip=np.concatenate([at_rest, desired[None]], axis=1),
+    )
+    with progress("plan: inverse network", total=1) as advance:
+        found = predictor.rollout_dual(episodes)
+        advance()
+    return found.control[0], found.tip[0]
 
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:

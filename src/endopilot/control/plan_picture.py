@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import AdviserConfig
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.files import writing

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import AdviserConfig
 from endopilot.belief.belief import Belief
 from endopilot.belief.monitor import predicted_tip
 from endopilot.belief.watch import Watch

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.device import Wire, lateral_reach
-from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import stored_arrays, writing
+from endopilot.lines import places_on
 from endopilot.tasks.route import Route
 from endopilot.types import Centerline
 
@@ -115,7 +115,7 @@ def _other(route: Route, at_mm: float) -> Centerline | None:
 
 def _sampled(line: Centerline, abscissa: np.ndarray, here: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, "n"]:
     """Return points of a line in a frame, and radii."""
-    points = np.stack([np.interp(abscissa, line.abscissa, axis) for axis in line.points.T], axis=-1)
+    points = places_on(line.points, line.abscissa, abscissa)
     beyond = np.minimum(abscissa - line.abscissa[0], 0.0)[:, None]
     first = line.points[min(2, len(line.points) - 1)] - line.points[0]
     points = points + beyond * first / max(np.linalg.norm(first), 1e-9)
@@ -168,13 +168,10 @@ class TurnNetwork:
     @staticmethod
     def read(path: Path) -> TurnNetwork:
         """Read one, or raise `InputError` where there is none."""
-        try:
-            with np.load(path) as held:
-                count = sum(name.startswith("w") for name in held.files)
-                layers = tuple((held[f"w{k}"].astype(float), held[f"b{k}"].astype(float)) for k in range(count))
-                return TurnNetwork(held["mean"].astype(float), held["scale"].astype(float), layers)
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(f"{path}: no network of turns; make one by python -m benchmarks turn-network") from error
+        with stored_arrays(path, "network of turns", "make one by python -m benchmarks turn-network") as held:
+            count = sum(name.startswith("w") for name in held.files)
+            layers = tuple((held[f"w{k}"].astype(float), held[f"b{k}"].astype(float)) for k in range(count))
+            return TurnNetwork(held["mean"].astype(float), held["scale"].astype(float), layers)
 
 
 def fourier(azimuth: Float[np.ndarray, "*n"], terms: int) -> Float[np.ndarray, "*n terms"]:

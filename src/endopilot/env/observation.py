@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.tree import parallel_transport, tangents
 from endopilot.devices.stack import column_prefixes
 from endopilot.env.exposures import Exposed
+from endopilot.lines import places_on
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import SimulatorState, Step
 from endopilot.tasks.navigation import Navigation, is_safe, reached
@@ -83,7 +84,7 @@ class RouteTables:
 def _tables(route: Route) -> tuple[np.ndarray, np.ndarray]:
     line = route.line
     along = np.arange(0.0, line.abscissa[-1], STEP_MM)
-    point = np.column_stack([np.interp(along, line.abscissa, axis) for axis in line.points.T])
+    point = places_on(line.points, line.abscissa, along)
     radius = np.interp(along, line.abscissa, line.radius)
     tangent, normal = tangents(point), parallel_transport(point)
     frame = np.stack([tangent, normal, np.cross(tangent, normal)], axis=1)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, read_dataset
 from endopilot.devices.device import Wire
@@ -98,7 +97,7 @@ def evaluate(
         if trained_patients(other, read_run(other), whole) != known:
             raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
     inputs = run_inputs(run_folder) | {"dataset": whole.manifest["key"]}
-    about = {"robot": robot, "other_seeds": other_seeds, "config": config, "version": __version__}
+    about = {"robot": robot, "other_seeds": other_seeds, "config": config}
     claim(output, "endopilot evaluate", inputs=inputs, **about)
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
     held_out, training = _parted(whole, known)

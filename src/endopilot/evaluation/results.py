@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.errors import InputError
 from endopilot.evaluation.metrics import (
     control_rmse,
     distribution,
@@ -22,7 +21,7 @@ from endopilot.evaluation.metrics import (
     span_slices,
     tip_statistics,
 )
-from endopilot.files import reading, regular, writing
+from endopilot.files import stored_arrays, writing
 
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
 """What an evaluation writes into its folder."""
@@ -131,18 +130,11 @@ def write_results(results: Mapping[str, SplitResult], path: Path) -> None:
 
 def read_results(path: Path) -> dict[str, SplitResult]:
     """Read what `write_results` wrote; InputError if it is missing or damaged."""
-    path, nested = regular(path), dict[str, Any]()
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file.items())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; run `endopilot evaluate` first") from error
-    except Exception as error:  # numpy raises many kinds on a damaged archive
-        raise InputError(f"{path}: damaged ({error}); run `endopilot evaluate` again") from error
-    for key, array in arrays.items():
-        *way, last = key.split("/")
-        functools.reduce(lambda parts, part: parts.setdefault(part, {}), way, nested)[last] = array
-    with reading(path, "run `endopilot evaluate` again"):
+    nested = dict[str, Any]()
+    with stored_arrays(path, "evaluation", "run `endopilot evaluate` again") as file:
+        for key, array in file.items():
+            *way, last = key.split("/")
+            functools.reduce(lambda parts, part: parts.setdefault(part, {}), way, nested)[last] = array
         return {split: _read_split(**fields) for split, fields in nested.items()}
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import AdviserConfig
 from endopilot.belief.events import count_events
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError

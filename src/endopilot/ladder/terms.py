@@ -11,7 +11,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from endopilot import __version__
 from endopilot.atlas.atlas import make_patient_tree
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
@@ -97,11 +96,11 @@ class Terms:
         }
 
     def identity(self, policy: str) -> dict[str, Any]:
-        """Return what a policy's results follow from: its source, tasks, their devices, robot, world and version."""
+        """Return what a policy's results follow from: its source, tasks, their devices, robot and world."""
         found = {"policy": policy, "origin": POLICIES.origin(policy), "tasks": self._tasks, "robot": self.robot}
         found |= {"request": self.request} if self.request else {}
         found |= {"thinking_s": self.thinking_s} if self.thinking_s else {}
-        return found | {"world": self.world.differences(), "version": __version__}
+        return found | {"world": self.world.differences()}
 
     @property
     def _tasks(self) -> dict[str, str]:

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endopilot import __version__
 from endopilot.dataset.loader import read_joined
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
@@ -66,7 +65,7 @@ def train(dataset: str | Path | Sequence[str | Path], *, output: str | Path, con
         raise InputError("processor: cuda, but torch finds no GPU here; give cpu, or install torch for CUDA")
     folders = [Path(each) for each in ([dataset] if isinstance(dataset, str | Path) else dataset)]
     data = read_joined(folders)
-    claim(run, "endopilot train", config=config, dataset=data.manifest["key"], version=__version__)
+    claim(run, "endopilot train", config=config, dataset=data.manifest["key"])
     training, validation = Windows.of(Episodes.of_dataset(data.of_split("train"))), None
     if "seen_test" in data.split:
         validation = Windows.of(Episodes.of_dataset(data.of_split("seen_test")))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip, safety_ratio
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import AdviserConfig
 from endopilot.belief.events import Counted, astray_mm, count_events
 from endopilot.navigation.policy import BelievedTip, Observation, Proximals
 from endopilot.robot.robot import SimulatedRobot

@@ -11,7 +11,7 @@ from scipy.ndimage import zoom
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import HeartFit
-from endopilot.lines import length_along
+from endopilot.lines import length_along, places_on
 from endopilot.phantom.painter import Grid
 from endopilot.types import Centerline
 
@@ -67,16 +67,13 @@ def stents(lines: Sequence[Centerline], count: int, generator: np.random.Generat
         along = (begin + np.arange(0.0, length, _CROWN_MM)[:, None] + zigzag).ravel()
         around = np.tile(turn, len(along) // len(turn))
         along = np.clip(along, 0.0, line.abscissa[-1])
-
-        def at(values: np.ndarray, along: np.ndarray = along, line: Centerline = line) -> np.ndarray:
-            return np.stack([np.interp(along, line.abscissa, column) for column in values.T], axis=1)
-
-        normal = at(line.normals)
+        normal = places_on(line.normals, line.abscissa, along)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        side = np.cross(at(shape.tangents(line.points)), normal)
+        side = np.cross(places_on(shape.tangents(line.points), line.abscissa, along), normal)
         # A stent is no wider at one end than its balloon: the mean radius.
         radius = float(np.interp(along, line.abscissa, line.radius).mean())
-        points = at(line.points) + radius * (np.cos(around)[:, None] * normal + np.sin(around)[:, None] * side)
+        points = places_on(line.points, line.abscissa, along)
+        points += radius * (np.cos(around)[:, None] * normal + np.sin(around)[:, None] * side)
         strut_mm = np.hypot(radius * 0.01, np.abs(np.gradient(zigzag)))
         mass = np.tile(strut_mm * _STRUT_MM2 * _STRUT_HU, len(along) // len(turn))
         found.append(Metal(points, mass))

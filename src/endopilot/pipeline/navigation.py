@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate import NavigateConfig, PatientNavigation, SetUp, drive, set_up_navigation
@@ -84,7 +83,6 @@ def _claim(output: Path, set_up: SetUp) -> None:
         world=set_up.world.differences(),
         policy=set_up.policy_name,
         policy_origin=set_up.policy_origin,
-        version=__version__,
     )
 
 

@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
@@ -159,7 +158,7 @@ def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = D
     """
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
-    claim(output, "endopilot demo", config=config, device=device, version=__version__)
+    claim(output, "endopilot demo", config=config, device=device)
     run = _Run(
         output=output,
         config=config,
@@ -214,7 +213,7 @@ def run_volume(
     content, device = read_volume(volume, series=series, phase=phase), read_wire(config.device)
     inputs = input_hash(volume, content.files)
     identity = {"volume_sha256": inputs[volume.name], "method": METHODS.origin(config.segmentation.method)}
-    claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
+    claim(output, "endopilot run", **identity, config=config, device=device)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
     folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     stages.do("read", lambda: write_volume(content, copy))

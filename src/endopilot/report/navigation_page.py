@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import AdviserConfig
 from endopilot.control.navigate import PatientNavigation, SetUp
 from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.plan_picture import draw_route, legend_above

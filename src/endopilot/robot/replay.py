@@ -318,7 +318,7 @@ def _simulated(
         for row, (k, j) in enumerate((k, j) for k in some for j in range(angles.shape[1])):
             ends = times[k, 1 : last + 1]
             places = np.column_stack([moved.tip_position[row, :, 0], moved.tip.abscissa[row, :, 0]])
-            at_tips = np.column_stack([np.interp(seen_s[k], ends, column) for column in places.T])
+            at_tips = places_on(places, ends, seen_s[k])
             tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
             nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
             branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]

@@ -13,13 +13,11 @@ suffix                   content
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -29,7 +27,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
-from endopilot.files import json_text, regular, writing
+from endopilot.files import json_text, stored_arrays, writing
 from endopilot.settings import public
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, place
@@ -69,16 +67,6 @@ class SimulationSetUp:
         return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
 
 
-@contextmanager
-def _stored(path: Path | str, what: str, mend: str) -> Iterator[Any]:
-    """Open an .npz file; InputError if it is missing, or `what` the block takes out of it is not there."""
-    try:
-        with np.load(regular(path), allow_pickle=False) as stored:
-            yield stored
-    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
-        raise InputError(f"{path}: no {what} ({error}); {mend}") from None
-
-
 @dataclass(frozen=True, eq=False)
 class SimulatorState:
     """All that the worlds' future depends on: restored, also in another process, they go on with the same bits.
@@ -97,7 +85,7 @@ class SimulatorState:
     @staticmethod
     def read(path: Path | str) -> SimulatorState:
         """Read a state; InputError if the file is missing or is no saved state."""
-        with _stored(path, "saved state of a simulator", "write one with SimulatorState.write") as stored:
+        with stored_arrays(path, "saved state of a simulator", "write one with SimulatorState.write") as stored:
             count = sum(name.startswith("values_") for name in stored.files)
             return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
 
@@ -292,7 +280,7 @@ def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
 def read_trajectory(path: str | Path, *, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
     """Read a trajectory from an .npz file; without its anatomy (of all worlds, or one for each) it is not replayed or
     plotted. Raises InputError for another file, version or vessel."""
-    with _stored(path, "trajectory", "give a file that Trajectory.write made") as stored:
+    with stored_arrays(path, "trajectory", "give a file that Trajectory.write made") as stored:
         about = json.loads(str(stored["about"]))
         arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:

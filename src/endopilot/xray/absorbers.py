@@ -142,7 +142,7 @@ def in_catheter(
     inside = np.logical_and.accumulate((behind > 0)[::-1])[::-1]
     distance, places, _ = line or catheter_line(anatomy)
     aside = nodes[inside] - start.position + behind[inside, None] * start.direction
-    laid = np.stack([np.interp(behind[inside], distance, axis) for axis in places.T], axis=-1)
+    laid = places_on(places, distance, behind[inside])
     past = np.maximum(behind[inside] - distance[-1], 0.0)[:, None]
     moved = nodes.astype(float).copy()
     moved[inside] = laid + aside + past * (places[-1] - places[-2])
@@ -208,7 +208,7 @@ def _tube(
     along = length_along(nodes)
     at = np.arange(step_mm / 2, min(along[-1], most_mm), step_mm)
     axis = places_on(nodes, along, at)
-    heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
+    heading = places_on(np.gradient(nodes, along, axis=0), along, at)
     first, second = across(heading)
     spokes = int(np.ceil(2 * np.pi * radius_mm / _SPOKE_MM))
     turn = np.linspace(0, 2 * np.pi, spokes, endpoint=False)[:, None, None]

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.projection import TipProjector
 from endopilot.anatomy.tree import tangents
 from endopilot.errors import InputError
+from endopilot.lines import places_on
 from endopilot.settings import Finite, Positive, settings
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -141,10 +142,8 @@ def measurement_at(
     line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
     centre = anatomy.insertion.position + abscissa * tangent
     if abscissa > 0:
-        centre, tangent = (
-            np.array([np.interp(abscissa, line.abscissa, axis) for axis in values.T])
-            for values in (line.points, tangents(line.points))
-        )
+        at = np.array([abscissa])
+        centre, tangent = (places_on(of, line.abscissa, at)[0] for of in (line.points, tangents(line.points)))
     outwards = places[0] - centre
     outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
     axes = np.array([tangent, outwards, np.cross(tangent, outwards)])
