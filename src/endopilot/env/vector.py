@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.devices.device import read_wire
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
+from endopilot.devices.stack import Stack
 from endopilot.env.exposures import CArms, Picture
 from endopilot.env.observation import (
     CONTROL_PERIOD_S,
@@ -89,6 +90,7 @@ class NavigateVectorEnv(VectorEnv):
         anatomy: Anatomy | str | Path | None = None,
         target: str | Place | None = None,
         *,
+        device: Wire | str | Path | None = None,
         navigations: Navigation | Sequence[Navigation] | None = None,
         task: str | None = None,
         patient: int = 0,
@@ -110,8 +112,9 @@ class NavigateVectorEnv(VectorEnv):
 
         Args:
             num_envs: number of worlds.
-            anatomy: a vessel of your own, or its folder, for the wire `workhorse-014`.
+            anatomy: a vessel of your own, or its folder.
             target: where the tip is to go in it, as `Anatomy.target` does: a section such as "LAD", or a point.
+            device: the wire in it, its name or its YAML file; `workhorse-014` if not given.
             navigations: in place of these, one for all worlds, or several, of which world i has number i modulo their
                 number.
             task: in place of them, the name of a task of the ladder.
@@ -135,7 +138,7 @@ class NavigateVectorEnv(VectorEnv):
                 fewer steps.
 
         Raises:
-            InputError: no world, no such task, target or catheter, a catheter for navigations of one's own; a device
+            InputError: no world, no such task, target or catheter, a device or a catheter for navigations that have theirs; a device
                 that is slower than an action of 1 or does not fit; navigations with different catheters; no such robot
                 or world, or worlds that cannot be stepped together.
         """
@@ -154,17 +157,20 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError(f"pixels: {pixels}; give {_PIXELS[0]} to {_PIXELS[1]}")
         if (anatomy is None) != (target is None):
             raise InputError("anatomy, target: give both, such as NavigateEnv(anatomy, target='LAD'), or neither")
+        if device is not None and anatomy is None:
+            raise InputError("device: give it with anatomy and target, or to the navigations")
+        if catheter is not None and navigations is not None:
+            raise InputError(f"catheter: {catheter}; give it to the navigations")
         if anatomy is not None and target is not None:
             vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-            navigations = [Navigation(anatomy=vessel, device=read_wire("workhorse-014"), target=vessel.target(target))]
-            navigations = in_catheter(navigations, catheter) if catheter else navigations
+            wire = Stack.of(device or "workhorse-014").wire
+            given = [Navigation(anatomy=vessel, device=wire, target=vessel.target(target))]
         elif navigations is None:
             ours = task or version != 1
-            navigations = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
-            navigations = in_catheter(navigations, catheter) if catheter else navigations
-        elif catheter:
-            raise InputError(f"catheter: {catheter}; give it to the navigations")
-        given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
+            given = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
+        else:
+            given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
+        given = in_catheter(given, catheter) if catheter else given
         longest = max((navigation.periods(CONTROL_PERIOD_S) for navigation in given), default=0)
         if max_episode_steps is not None and longest > max_episode_steps:
             raise InputError(
