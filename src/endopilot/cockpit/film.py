@@ -26,6 +26,7 @@ from endopilot.files import reading, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.progress import progress
+from endopilot.runs import Place
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import TRAJECTORY, SimulationSetUp, Trajectory, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
@@ -210,11 +211,8 @@ def _film(
 def write_film(film: Film, output: Path) -> None:
     """Write wire and catheters of a film as lines, LPS mm, with the wall's force on each node, N: at its end (.vtp, a
     model), or every 0.2 s (.seq.mrb, a sequence). Raises InputError for another suffix, or a film that fails."""
-    whole = output.name.lower().endswith(".seq.mrb")
-    if not whole and output.suffix.lower() != ".vtp":
-        raise InputError(
-            f"{output}: no file of 3D Slicer; name it .seq.mrb for the motion, .vtp for the path at its end"
-        )
+    Place("file", (".seq.mrb", ".vtp")).files(output)
+    whole = output.suffix.lower() != ".vtp"
     with progress("Driving again", 1) as advance:
         shown = [frame.snapshot for frame in film.make()]
         advance()

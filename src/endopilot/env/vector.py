@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -34,6 +34,7 @@ from endopilot.env.observation import (
 )
 from endopilot.env.reality import Reality
 from endopilot.errors import InputError
+from endopilot.settings import public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -84,6 +85,7 @@ class NavigateVectorEnv(VectorEnv):
         "render_fps": 1.0 / CONTROL_PERIOD_S,
     }
 
+    @public
     def __init__(
         self,
         num_envs: int = 1,
@@ -102,10 +104,10 @@ class NavigateVectorEnv(VectorEnv):
         c_arm: FluoroscopeConfig | None = None,
         world: World | str | Path | Sequence[World | str | Path] | None = None,
         robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep", "Disabled"] = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
-        render_mode: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
         max_episode_steps: int | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
@@ -138,21 +140,12 @@ class NavigateVectorEnv(VectorEnv):
                 fewer steps.
 
         Raises:
-            InputError: no world, no such task, target or catheter, a device or a catheter for navigations that have theirs; a device
-                that is slower than an action of 1 or does not fit; navigations with different catheters; no such robot
-                or world, or worlds that cannot be stepped together.
+            InputError: no world, no such task, target, device or catheter, or one of these for navigations that have
+                theirs; a device that is slower than an action of 1 or does not fit; navigations with different
+                catheters; no such robot or world, or worlds that cannot be stepped together.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode: {render_mode!r}; give 'rgb_array' or None")
-        try:
-            autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            modes = ", ".join(mode.value for mode in AutoresetMode)
-            raise InputError(f"autoreset_mode: {autoreset_mode!r}; give an AutoresetMode, or one of {modes}") from None
-        if observation not in get_args(Observed):
-            raise InputError(f"observation: {observation!r}; choose from {', '.join(get_args(Observed))}")
         if not _PIXELS[0] <= pixels <= _PIXELS[1]:
             raise InputError(f"pixels: {pixels}; give {_PIXELS[0]} to {_PIXELS[1]}")
         if (anatomy is None) != (target is None):
@@ -182,7 +175,7 @@ class NavigateVectorEnv(VectorEnv):
         every = [given[number % len(given)] for number in range(num_envs)]
         arms = {"config": c_arm or FluoroscopeConfig(), "pixels": pixels if observation == "image" else 0}
         reality = {"world": world, "robot": robot, "motion": motion, "config": config}
-        self._given = (every, observation, autoreset_mode, arms, reality)
+        self._given = (every, observation, AutoresetMode(autoreset_mode), arms, reality)
         self._prepare(*self._given)
         self.render_mode = render_mode
 
