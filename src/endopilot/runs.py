@@ -41,7 +41,8 @@ class Place:
 Existing = Annotated[Path, Place("input")]
 OutputFolder = Annotated[Path, Place("folder")]
 OutputFile = Annotated[Path, Place("file")]
-Picture = Annotated[Path, Place("file", (".png",))]
+PNG, CSV = Place("file", (".png",)), Place("file", (".csv",))
+Picture, Table = Annotated[Path, PNG], Annotated[Path, CSV]
 Page = Annotated[Path, Place("file", (".html",))]
 
 

@@ -201,7 +201,7 @@ def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
 def read_settings(path: Path, cls: type[T], *, onto: T | None = None, remedy: str = "") -> T:
     """Read settings from a JSON file (by its suffix) or a YAML file, as `from_record` has it; `remedy` is what else to
     do about a bad file, such as "run `endopilot advise` again"."""
-    content = read_json(path) if Path(path).suffix == ".json" else read_yaml(path)
+    content = read_json(path) if Path(path).suffix.lower() == ".json" else read_yaml(path)
     try:
         return from_record(cls, content, onto=onto)
     except InputError as error:

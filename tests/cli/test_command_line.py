@@ -101,9 +101,14 @@ def test_a_missing_input_is_reported_in_one_line(
 
 def test_a_suffix_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The folder holds no anatomy, which is found out when the work begins."""
-    with pytest.raises(SystemExit, match="2"):
-        main(["simulate", str(tmp_path), "-o", str(tmp_path / "a.txt")])
-    assert "a.txt: is written as .parquet or .csv or .npz; end the name so" in capsys.readouterr().err
+    folder, lines = str(tmp_path), tmp_path / "lines.csv"
+    lines.touch()
+    for arguments, message in (
+        (("simulate", folder, "-o", "a.txt"), "a.txt: is written as .parquet or .csv or .npz; end the name so"),
+        (("simulate", folder, "-o", "A.CSV", "--shape"), "A.CSV: wire shapes do not fit a table; write them as .npz"),
+        (("locate", folder, str(lines), "-o", "tips.txt"), "tips.txt: is written as .csv; end the name so"),
+    ):
+        assert refused(capsys, *arguments).endswith(message)
 
 
 def test_a_closed_output_is_no_error() -> None:

@@ -41,6 +41,6 @@ def test_a_sequence_holds_each_line_at_its_time(film, tmp_path):
 
 
 def test_another_name_is_refused_and_nothing_is_written(film, tmp_path):
-    with pytest.raises(InputError, match=r"wire.mp4: no file of 3D Slicer; name it .seq.mrb"):
+    with pytest.raises(InputError, match=r"wire.mp4: is written as .seq.mrb or .vtp; end the name so"):
         write_film(film, tmp_path / "wire.mp4")
     assert not [*tmp_path.iterdir()]

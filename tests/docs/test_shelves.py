@@ -199,3 +199,9 @@ def test_the_readme_is_short() -> None:
 def test_the_readme_s_table_is_that_of_the_pages() -> None:
     table = README.split("<!-- stands:begin -->\n")[1].split("\n<!-- stands:end -->")[0]
     assert table == runpy.run_path(str(ROOT / "docs/readme.py"))["stands"](), "run: python docs/readme.py"
+
+
+def test_the_start_page_opens_the_replay_at_its_scene() -> None:
+    place = re.search(r'src="replay\.html#(\w+)"', (ROOT / "docs/index.md").read_text(encoding="utf-8"))
+    page = (ROOT / "src/endopilot/report/templates/navigation.html.j2").read_text(encoding="utf-8")
+    assert place and re.search(rf'<section id="{place[1]}">\s*<h2>[^<]*</h2>\s*<figure>\s*<div class="scene">', page)

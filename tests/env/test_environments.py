@@ -149,6 +149,7 @@ def test_an_anatomy_and_a_target_are_an_environment():
     one, many = NavigateEnv(anatomy, "2"), NavigateVectorEnv(2, anatomy, target="2", patients=1)
     assert one.reset(seed=0)[1] == {name: value[0] for name, value in many.reset(seed=0)[1].items() if name[0] != "_"}
     assert many.navigations[0].target == find_target(anatomy.tree, "2")
+    assert NavigateEnv(anatomy, "2", device="j-035").simulator.set_up.stacks[0].name == "j-035"
     with pytest.raises(InputError, match="anatomy, target: give both"):
         NavigateEnv(anatomy)
     with pytest.raises(InputError, match=r"target: 'G1\.2'; the vessel has no such section"):
@@ -342,6 +343,7 @@ def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
         ({"navigations": None, "task": "moon"}, "task: 'moon'"),
         ({"navigations": None, "catheter": "hose"}, "catheter 'hose'"),
         ({"catheter": "microcatheter-1.7f"}, r"catheter: microcatheter-1\.7f; give it to the navigations"),
+        ({"device": "j-035"}, "device: give it with anatomy and target, or to the navigations"),
         ({"robot": "none"}, "robot 'none': no such robot or file"),
         ({"render_mode": "human"}, "render_mode: 'human'"),
         ({"observation": "image", "pixels": 32}, "pixels: 32; give 64 to 128"),

@@ -120,6 +120,13 @@ def test_an_aorta_in_cm_is_asked_for_with_both_sizes_and_an_answer_counts(tmp_pa
     assert "read as cm (--scale) in LPS (not stated)" in made.provenance["notes"][0]
 
 
+def test_a_phantom_that_could_be_an_aorta_in_cm_is_asked_for_unless_its_artery_is_named():
+    points = np.array([[0.0, 0.0, 0.0], [43.0, 41.0, 0.0]])
+    with pytest.raises(InputError, match=r"0\.95 mm in mm \(--scale 1\), or .*9\.5 mm in cm \(--scale 10\)"):
+        check_unit(points, 0.95, "generic", "phantom", odds=ASSUMED)
+    check_unit(points, 0.95, "rca", "phantom", odds=ASSUMED)
+
+
 @pytest.mark.parametrize(("place", "value"), [(slice(-3, None), np.nan), (slice(-3, None), -1.5), (40, np.nan)])
 def test_radii_that_are_none_are_that_before_at_an_end_and_named_elsewhere(tmp_path, place, value):
     axis = line((0, 0, 0), (0, 0, 60))

@@ -155,6 +155,14 @@ def test_a_file_says_what_its_arrays_mean(moving_pair, tmp_path) -> None:
     assert about["arrays"]["wall_force"]["axes"] == "worlds samples"
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+def test_capital_letters_of_a_suffix_mean_the_same(wire_alone, tmp_path, suffix) -> None:
+    for name in (f"wire{suffix}", f"WIRE{suffix.upper()}"):
+        wire_alone.write(tmp_path / name)
+    small, large = ((tmp_path / name).read_bytes() for name in (f"wire{suffix}", f"WIRE{suffix.upper()}"))
+    assert small == large
+
+
 def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire_alone, tmp_path) -> None:
     path = tmp_path / "wire.npz"
     wire_alone.write(path)
@@ -174,7 +182,7 @@ def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire
     _refused(tmp_path / "older.npz", vessel, "lacks tip_twist, which this version records; simulate it again")
     _refused(path, make_patient(AtlasConfig(count=2), 1), f"world 0 is of another vessel, '{vessel.name}'")
     _refused(path, [vessel], f"world 1 is of another vessel, '{vessel.name}'")
-    with pytest.raises(InputError, match=r"written as \.parquet, \.csv or \.npz"):
+    with pytest.raises(InputError, match=r"written as \.parquet or \.csv or \.npz"):
         wire_alone.write(tmp_path / "wire.txt")
 
 

@@ -13,7 +13,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import Figures
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.runs import Existing, OutputFile, Page, Picture
+from endopilot.runs import Existing, Page, Picture, Table
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
 from endopilot.xray.frames import read_frames, write_locations
@@ -26,7 +26,7 @@ def locate_command(
     /,
     *,
     camera: tuple[Existing, ...] = (),
-    output: OutputFile,
+    output: Table,
     picture: Picture | None = None,
     page: Page | None = None,
     device: str = "workhorse-014",

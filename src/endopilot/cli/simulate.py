@@ -17,13 +17,13 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
 from endopilot.progress import progress
-from endopilot.runs import Existing, Picture, Place
+from endopilot.runs import Existing, Picture
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.motion import MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_worlds
-from endopilot.simulation.trajectory import SimulationSetUp, Trajectory, read_trajectory
+from endopilot.simulation.trajectory import WRITTEN, SimulationSetUp, Trajectory, read_trajectory, trajectory_suffix
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
@@ -46,7 +46,7 @@ def simulate_command(
     anatomy: Existing,
     /,
     *,
-    output: Annotated[Path, Place("file", (".parquet", ".csv", ".npz"))],
+    output: Annotated[Path, WRITTEN],
     device: str | None = None,
     catheter: tuple[str, ...] = (),
     controls: Existing | None = None,
@@ -72,6 +72,7 @@ def simulate_command(
         picture: PNG of the vessel with the first navigation's wire and catheters at its end.
         random: the random controls, if no others are given.
     """
+    trajectory_suffix(output, shape=shape)  # before the work
     if picture is not None:
         require_extras("report")
     patient = read_anatomy(anatomy)
@@ -99,7 +100,7 @@ def simulate_command(
                 )
         else:
             trajectory = simulate(patient, stack, control, initial=initial, config=config, **also)
-    elif controls.is_dir() or controls.suffix == ".npz":
+    elif controls.is_dir() or controls.suffix.lower() == ".npz":
         recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
         patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
         also |= {"config": None if config == SimulatorConfig() else config}

@@ -26,6 +26,7 @@ from endopilot.files import reading, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.progress import progress
+from endopilot.runs import Place
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import TRAJECTORY, SimulationSetUp, Trajectory, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
@@ -92,11 +93,11 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         with reading(path, "make the data set again"):
             data = read_dataset(path)[world]
             return _film(data.set_up(), data.command[0], data.sample_period_s, {}, f"episode {world} of {path.name}")
-    if path.suffix == ".json":
+    if path.suffix.lower() == ".json":
         with reading(path, "give a file of the ladder as it was written"):
             return _of_the_ladder(*recorded_navigation(path, task, world))
     recorded = path / TRAJECTORY if path.is_dir() else path
-    if recorded.suffix != ".npz" or not recorded.exists():
+    if recorded.suffix.lower() != ".npz" or not recorded.exists():
         raise InputError(
             f"{path}: cannot be replayed; give a session ({SUFFIX}), a trajectory (.npz), a folder of a plan, a "
             "navigation or a data set, or a file of the ladder (.json)"
@@ -210,11 +211,8 @@ def _film(
 def write_film(film: Film, output: Path) -> None:
     """Write wire and catheters of a film as lines, LPS mm, with the wall's force on each node, N: at its end (.vtp, a
     model), or every 0.2 s (.seq.mrb, a sequence). Raises InputError for another suffix, or a film that fails."""
-    whole = output.name.endswith(".seq.mrb")
-    if not whole and output.suffix != ".vtp":
-        raise InputError(
-            f"{output}: no file of 3D Slicer; name it .seq.mrb for the motion, .vtp for the path at its end"
-        )
+    Place("file", (".seq.mrb", ".vtp")).files(output)
+    whole = output.suffix.lower() != ".vtp"
     with progress("Driving again", 1) as advance:
         shown = [frame.snapshot for frame in film.make()]
         advance()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.devices.device import read_wire
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import RobotConfig
+from endopilot.devices.stack import Stack
 from endopilot.env.exposures import CArms, Picture
 from endopilot.env.observation import (
     CONTROL_PERIOD_S,
@@ -33,6 +34,7 @@ from endopilot.env.observation import (
 )
 from endopilot.env.reality import Reality
 from endopilot.errors import InputError
+from endopilot.settings import public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -83,12 +85,14 @@ class NavigateVectorEnv(VectorEnv):
         "render_fps": 1.0 / CONTROL_PERIOD_S,
     }
 
+    @public
     def __init__(
         self,
         num_envs: int = 1,
         anatomy: Anatomy | str | Path | None = None,
         target: str | Place | None = None,
         *,
+        device: Wire | str | Path | None = None,
         navigations: Navigation | Sequence[Navigation] | None = None,
         task: str | None = None,
         patient: int = 0,
@@ -100,18 +104,19 @@ class NavigateVectorEnv(VectorEnv):
         c_arm: FluoroscopeConfig | None = None,
         world: World | str | Path | Sequence[World | str | Path] | None = None,
         robot: RobotConfig | str | Path | Sequence[RobotConfig | str | Path] | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep", "Disabled"] = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
-        render_mode: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
         max_episode_steps: int | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
 
         Args:
             num_envs: number of worlds.
-            anatomy: a vessel of your own, or its folder, for the wire `workhorse-014`.
+            anatomy: a vessel of your own, or its folder.
             target: where the tip is to go in it, as `Anatomy.target` does: a section such as "LAD", or a point.
+            device: the wire in it, its name or its YAML file; `workhorse-014` if not given.
             navigations: in place of these, one for all worlds, or several, of which world i has number i modulo their
                 number.
             task: in place of them, the name of a task of the ladder.
@@ -135,36 +140,30 @@ class NavigateVectorEnv(VectorEnv):
                 fewer steps.
 
         Raises:
-            InputError: no world, no such task, target or catheter, a catheter for navigations of one's own; a device
-                that is slower than an action of 1 or does not fit; navigations with different catheters; no such robot
-                or world, or worlds that cannot be stepped together.
+            InputError: no world, no such task, target, device or catheter, or one of these for navigations that have
+                theirs; a device that is slower than an action of 1 or does not fit; navigations with different
+                catheters; no such robot or world, or worlds that cannot be stepped together.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode: {render_mode!r}; give 'rgb_array' or None")
-        try:
-            autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            modes = ", ".join(mode.value for mode in AutoresetMode)
-            raise InputError(f"autoreset_mode: {autoreset_mode!r}; give an AutoresetMode, or one of {modes}") from None
-        if observation not in get_args(Observed):
-            raise InputError(f"observation: {observation!r}; choose from {', '.join(get_args(Observed))}")
         if not _PIXELS[0] <= pixels <= _PIXELS[1]:
             raise InputError(f"pixels: {pixels}; give {_PIXELS[0]} to {_PIXELS[1]}")
         if (anatomy is None) != (target is None):
             raise InputError("anatomy, target: give both, such as NavigateEnv(anatomy, target='LAD'), or neither")
+        if device is not None and anatomy is None:
+            raise InputError("device: give it with anatomy and target, or to the navigations")
+        if catheter is not None and navigations is not None:
+            raise InputError(f"catheter: {catheter}; give it to the navigations")
         if anatomy is not None and target is not None:
             vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-            navigations = [Navigation(anatomy=vessel, device=read_wire("workhorse-014"), target=vessel.target(target))]
-            navigations = in_catheter(navigations, catheter) if catheter else navigations
+            wire = Stack.of(device or "workhorse-014").wire
+            given = [Navigation(anatomy=vessel, device=wire, target=vessel.target(target))]
         elif navigations is None:
             ours = task or version != 1
-            navigations = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
-            navigations = in_catheter(navigations, catheter) if catheter else navigations
-        elif catheter:
-            raise InputError(f"catheter: {catheter}; give it to the navigations")
-        given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
+            given = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]
+        else:
+            given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
+        given = in_catheter(given, catheter) if catheter else given
         longest = max((navigation.periods(CONTROL_PERIOD_S) for navigation in given), default=0)
         if max_episode_steps is not None and longest > max_episode_steps:
             raise InputError(
@@ -176,7 +175,7 @@ class NavigateVectorEnv(VectorEnv):
         every = [given[number % len(given)] for number in range(num_envs)]
         arms = {"config": c_arm or FluoroscopeConfig(), "pixels": pixels if observation == "image" else 0}
         reality = {"world": world, "robot": robot, "motion": motion, "config": config}
-        self._given = (every, observation, autoreset_mode, arms, reality)
+        self._given = (every, observation, AutoresetMode(autoreset_mode), arms, reality)
         self._prepare(*self._given)
         self.render_mode = render_mode
 

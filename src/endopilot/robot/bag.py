@@ -33,7 +33,7 @@ second row, a velocity."""
 
 def is_bag(path: Path) -> bool:
     """Return whether a path is a ROS bag, by its suffix or, of a folder, by what rosbag2 writes into it."""
-    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
 def read_bag(path: Path, topics: Sequence[str] = ()) -> Columns:

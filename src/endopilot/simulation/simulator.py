@@ -85,8 +85,6 @@ class Simulator(Readout):
                 finite, or negative at the ostium; lists of different lengths; stacks of different numbers of devices;
                 more worlds than the memory holds.
         """
-        if actuation not in ("velocity", "force"):
-            raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         config = config or SimulatorConfig()
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
         one = isinstance(device, Wire | Stack | str | Path)

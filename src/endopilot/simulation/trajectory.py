@@ -28,6 +28,7 @@ from endopilot.devices.stack import Stack, Transmission
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import json_text, stored_arrays, writing
+from endopilot.runs import Place
 from endopilot.settings import public
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion, place
@@ -90,6 +91,7 @@ class SimulatorState:
             return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
 
 
+WRITTEN = Place("file", (".parquet", ".csv", ".npz"))  # what a trajectory is written as
 TRAJECTORY = "trajectory.npz"  # name of the file in a folder that holds one navigation or plan
 FORMAT_VERSION = 1  # of the .npz file: raised when an array comes to mean something else
 _FORMAT = "endopilot trajectory"
@@ -188,21 +190,13 @@ class Trajectory(Step):
         return figure
 
     def write(self, path: Path | str) -> None:
-        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet. Raises
-        InputError for another suffix or shapes in a table, ModuleNotFoundError for .parquet without the extra `learn`.
-        """
-        path = Path(path)
-        if path.suffix not in (".parquet", ".csv", ".npz"):
-            raise InputError(f"{path}: a trajectory is written as .parquet, .csv or .npz; choose one of these suffixes")
-        if self.shape is not None and path.suffix != ".npz":
-            raise InputError(f"{path}: wire shapes do not fit a table; write them as .npz")
-        if path.suffix == ".parquet":
-            with extra_named(f"{path}"):
-                pass  # with which pandas writes it
+        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet. Raises what
+        `trajectory_suffix` does."""
+        path, suffix = Path(path), trajectory_suffix(path, shape=self.shape is not None)
         with writing(path) as partial:
-            if path.suffix == ".parquet":
+            if suffix == ".parquet":
                 trajectory_table(self).to_parquet(partial, index=False)
-            elif path.suffix == ".csv":
+            elif suffix == ".csv":
                 trajectory_table(self).to_csv(partial, index=False)
             else:
                 # what follows from others is left out, and further signals are marked as such
@@ -241,6 +235,19 @@ class Trajectory(Step):
         }
         tip = TipProjection(**{name: take(each) for name, each in vars(self.tip).items()})
         return replace(self, tip=tip, columns={name: take(each) for name, each in self.columns.items()}, **chosen)
+
+
+def trajectory_suffix(path: Path | str, *, shape: bool) -> str:
+    """Return the suffix that a trajectory is written by, in lower case. Raises InputError for another, or a table of
+    wires' shapes, ModuleNotFoundError for .parquet without the extra `learn`."""
+    WRITTEN.files(Path(path))
+    suffix = Path(path).suffix.lower()
+    if shape and suffix != ".npz":
+        raise InputError(f"{path}: wire shapes do not fit a table; write them as .npz")
+    if suffix == ".parquet":
+        with extra_named(f"{path}"):
+            import pyarrow  # noqa: F401  # with which pandas writes it
+    return suffix
 
 
 def trajectory_signals(trajectory: Trajectory) -> dict[str, np.ndarray]:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.errors import InputError
 from endopilot.files import writing
+from endopilot.runs import CSV
 from endopilot.simulation.csv_file import read_columns
 from endopilot.xray.line_observations import DeviceFrame, Line
 from endopilot.xray.tip_filter import TipLocation
@@ -67,9 +67,7 @@ def write_locations(locations: Sequence[TipLocation], *, output: str | Path) -> 
     """
     import pandas as pd
 
-    path = Path(output)
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"{path}: tips are written as CSV; give a name that ends in .csv")
+    CSV.files(Path(output))
     upper = [(i, j) for i in range(3) for j in range(i, 3)]
     rows = [
         {
@@ -85,5 +83,5 @@ def write_locations(locations: Sequence[TipLocation], *, output: str | Path) -> 
         }
         for one in locations
     ]
-    with writing(path) as partial:
+    with writing(Path(output)) as partial:
         pd.DataFrame(rows).to_csv(partial, index=False, float_format="%.4f")

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from endopilot.devices.stack import Stack, lines_from_tips
-from endopilot.errors import InputError
 from endopilot.files import png_image, writing
+from endopilot.runs import PNG
 from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, public, settings
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
@@ -88,10 +88,8 @@ class XrayImage:
         Raises:
             InputError: the suffix is not .png, or the file cannot be written.
         """
-        path = Path(path)
-        if path.suffix != ".png":
-            raise InputError(f"{path}: an image is written as PNG; give a name that ends in .png")
-        with writing(path) as partial:
+        PNG.files(Path(path))
+        with writing(Path(path)) as partial:
             partial.write_bytes(png_image(self.grey))
 
 
