@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,18 @@ import pytest
 from endopilot.cli import main
 
 
-def run(
-    capsys: pytest.CaptureFixture[str], *arguments: str | Path, command: Callable[[list[str]], None] = main
-) -> dict[str, Any]:
-    """Run a command with --json and return its figures."""
+def output_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path, code: int = 0) -> str:
+    """Run a command that ends with this code, and return what it prints."""
     with pytest.raises(SystemExit) as leaving:
-        command([*map(str, arguments), "--json"])
+        main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
-    assert leaving.value.code == 0, captured.err
-    return json.loads(captured.out)
+    assert leaving.value.code == code, captured.err
+    return captured.out
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Any:
+    """Run a command with --json and return its figures."""
+    return json.loads(output_of(capsys, *arguments, "--json"))
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:

@@ -175,7 +175,18 @@ def test_coco_has_the_masks_and_keypoints(made, cines):
     assert seen == set(CLASSES)
 
 
-def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(made, patient, fork, tmp_path):
+@pytest.mark.parametrize("scheduler", [None, "tcp://here:1"])
+def test_an_interrupted_run_goes_on_here_and_on_a_cluster_with_the_same_bits(
+    made, patient, fork, tmp_path, monkeypatch, scheduler
+):
+    asked = []
+
+    def run(work, items, done, scheduler):
+        for item in items:
+            asked.append(scheduler)
+            done(item, work(item))
+
+    monkeypatch.setattr("endopilot.dataset.generate.run_on_cluster", run)
     assert read_anatomy(made / "patients" / "fork").identity == fork.identity
     assert (made / "samples.png").stat().st_size > 1000
     output = tmp_path / "again"
@@ -185,19 +196,10 @@ def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(made, patient, f
     (output / "cines" / ".part-1-rest").mkdir()
     (output / "manifest.json").unlink()
     before = (kept / "cine.dcm").stat().st_mtime_ns
-    make_angiograms([patient], output=output, device=STACK, config=CONFIG)
+    make_angiograms([patient], output=output, device=STACK, config=CONFIG, scheduler=scheduler)
+    assert asked == ([scheduler] if scheduler else [])
     assert hashes(output) == hashes(made)
     assert (kept / "cine.dcm").stat().st_mtime_ns == before
-
-
-def test_a_cluster_gives_the_same_bits(made, patient, tmp_path, monkeypatch):
-    def run(work, items, done, scheduler):
-        for item in reversed(items):
-            done(item, work(item))
-
-    monkeypatch.setattr("endopilot.dataset.generate.run_on_cluster", run)
-    make_angiograms([patient], output=tmp_path / "there", device=STACK, config=CONFIG, scheduler="tcp://here:1")
-    assert hashes(tmp_path / "there") == hashes(made)
 
 
 def test_the_command_drives_devices_by_a_policy(patient, tmp_path, capsys, monkeypatch):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command import output_of
 from endopilot.anatomy.io import write_anatomy
 from endopilot.belief import monitoring
 from endopilot.belief.advise import advise
@@ -18,7 +19,6 @@ from endopilot.belief.events import Counted
 from endopilot.belief.monitor import BelievedTip, Monitor
 from endopilot.belief.monitoring import AdviseConfig, Followed, Patient
 from endopilot.belief.network_monitor import NetworkMonitor
-from endopilot.cli import main
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import Dataset, read_dataset
@@ -249,10 +249,7 @@ def test_the_command_calibrates_measures_and_draws(folder, tmp_path, capsys) -> 
     make_toy_dataset(tmp_path / "all", **SHAPE, anatomy_shares=(0.0, 0.0, 1.0))
     run, dataset, output = folder / "run", folder / "dataset", folder / "out"
     others = [str(dataset), str(tmp_path / "other")]
-    with pytest.raises(SystemExit) as leave:
-        main(["advise", str(run), str(dataset), "-o", str(output), "--level", "0.5", "--also-test", *others])
-    assert leave.value.code == 0
-    printed = capsys.readouterr().out
+    printed = output_of(capsys, "advise", run, dataset, "-o", output, "--level", "0.5", "--also-test", *others)
     assert "missed_share" in printed and "exposures_per_minute" in printed
     figures = json.loads((output / "advice.json").read_text(encoding="utf-8"))
     assert Calibration.read(run).scale == figures["calibration"]["scale"] > 0

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from endopilot.cli import main
+from command import output_of
 
 ASK = 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _endopilot; echo "${COMPREPLY[@]}"'
 
@@ -20,9 +20,7 @@ def test_tab_completes_in_fish():
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_tab_completes(capsys, tmp_path):
-    with pytest.raises(SystemExit, match="0"):
-        main(["completion"])
-    (tmp_path / "script").write_text(capsys.readouterr().out)
+    (tmp_path / "script").write_text(output_of(capsys, "completion"))
     for words, completed in (
         (["endopilot", "na"], "navigate"),
         (["endopilot", "navigate", "patient", "--tar"], "--target"),

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.cli import main, process
+from endopilot.cli import main
 from endopilot.cli.arguments import show
 from endopilot.cli.process import EXIT_DEFECT, carry_out
 from endopilot.errors import InputError, Remark
@@ -245,21 +245,3 @@ def test_odd_names_are_shown_as_they_are(capsys, name):
     show([{"patient": name}], as_json=False)
     show({"patient": f"{name}\n"}, as_json=False)
     assert capsys.readouterr().out.count(name) == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("--nonesuch", "unrecognized arguments: --nonesuch"),
-        ("--sequences x", "sequences: 'x'; give a whole number from 1"),
-        ("", "Missing"),
-        ("--motion-seed -1", "motion_seed: -1; give a whole number from 0"),
-    ],
-)
-def test_bad_arguments_are_told_in_one_line(capsys, text, said):
-    given = ["patient", "-o", "r.csv"] if text else []
-    with pytest.raises(SystemExit) as leaving:
-        main(["simulate", *given, *text.split()])
-    errors = capsys.readouterr().err
-    assert leaving.value.code == 2 and len(errors.splitlines()) == 1 and said in errors
-    assert process.EXIT_BAD_INPUT == 2

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from endopilot.cockpit.film import EVERY, Film, FilmFrame, write_film
-from endopilot.errors import InputError
 from endopilot.vessels import mesh_process
 
 
@@ -38,9 +37,3 @@ def test_a_sequence_holds_each_line_at_its_time(film, tmp_path):
     for number, each in enumerate(shown):
         read = mesh_process.read(str(tmp_path / "Wire" / "Data" / f"Wire_{number}.vtp"))
         np.testing.assert_array_equal(read["points"], each.nodes)
-
-
-def test_another_name_is_refused_and_nothing_is_written(film, tmp_path):
-    with pytest.raises(InputError, match=r"wire.mp4: is written as .seq.mrb or .vtp; end the name so"):
-        write_film(film, tmp_path / "wire.mp4")
-    assert not [*tmp_path.iterdir()]

@@ -15,19 +15,10 @@ import numpy as np
 import pytest
 
 from command import refused, run
-from endopilot.anatomy.io import write_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.volume import write_mask
 from endopilot.types import LumenMask, Volume
 
 SHORT = ("--sequences", "2", "--seconds", "2")
-
-
-@pytest.fixture(scope="module")
-def patient(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("patient") / "cerebral"
-    write_anatomy(make_patient(AtlasConfig(vessel="cerebral", seed=2), 0), output=folder)
-    return folder
 
 
 @pytest.fixture
@@ -48,14 +39,14 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path):
+def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, right_artery, capsys, tmp_path):
     (mask.parent / "thesis.txt").write_text("dear")
     before = content(mask.parent)
     inner = tmp_path / "scans" / "deeper"
     shutil.copytree(mask.parent, inner)
     for sources in ([mask], [mask, inner / mask.name]):
         assert "lies in the output" in refused(capsys, "anatomy", *sources, "-o", mask.parent)
-    assert "lies in the output" in refused(capsys, "navigate", patient, "--target", "M1", "-o", patient)
+    assert "lies in the output" in refused(capsys, "navigate", right_artery, "--target", "2", "-o", right_artery)
     shutil.rmtree(inner)
     assert content(mask.parent) == before
 
@@ -74,10 +65,10 @@ def test_a_finished_anatomy_is_made_again_from_the_same_mask_alone(mask, capsys,
     assert content(folder) == before
 
 
-def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(patient, capsys, tmp_path):
-    table, before = tmp_path / "rollout.csv", content(patient)
+def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(right_artery, capsys, tmp_path):
+    table, before = tmp_path / "rollout.csv", content(right_artery)
     table.write_text("theirs")
-    simulate = ("simulate", patient, "-o", table, *SHORT)
+    simulate = ("simulate", right_artery, "-o", table, *SHORT)
     assert "rollout.csv: is there already" in refused(capsys, *simulate)
     assert table.read_text() == "theirs"
     run(capsys, *simulate, "--overwrite")
@@ -86,8 +77,8 @@ def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_inp
     picture.write_text("theirs")
     assert "picture.png: is there already" in refused(capsys, *simulate[:3], tmp_path / "b.csv", "--picture", picture)
     for also in ((), ("--overwrite",)):
-        assert "lumen.nrrd" in refused(capsys, "phantom", patient, "-o", patient / "lumen.nrrd", *also)
-    assert content(patient) == before
+        assert "lumen.nrrd" in refused(capsys, "phantom", right_artery, "-o", right_artery / "lumen.nrrd", *also)
+    assert content(right_artery) == before
 
 
 def test_an_output_that_is_a_link_leads_where_it_points(mask, capsys, tmp_path):
@@ -132,8 +123,8 @@ def test_a_limit_on_files_leaves_no_compiled_module_cut_short(tmp_path):
         "simulate PATIENT --sequences 4 --seconds 10 --shape -o OUT.npz",
     ],
 )
-def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, patient, tmp_path):
-    names = {"MASK": str(mask), "PATIENT": str(patient)}
+def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, right_artery, tmp_path):
+    names = {"MASK": str(mask), "PATIENT": str(right_artery)}
     out, suffixes = tmp_path / "out" / "it", ("", ".nii.gz", ".nrrd", ".npz", ".png")
     names |= {f"OUT{suffix}": f"{out}{suffix}" for suffix in suffixes}
     ended = subprocess.run(

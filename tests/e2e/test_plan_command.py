@@ -10,17 +10,7 @@ import pytest
 from command import refused, run
 
 
-def test_xray_is_foreseen_along_a_plan(vessel, tmp_path, capsys):
-    plan = ("plan", vessel, "--target", "0,0,33", "--xray", "-o", tmp_path / "plan")
-    table = tmp_path / "plan" / "plan.csv"
-    by_wires = run(capsys, *plan)
-    assert len(by_wires["xray_due_s"]) <= 1  # straight on, near the middle
-    assert "band_tip_abscissa_mm" in table.read_text(encoding="utf-8").splitlines()[0]
-
-
 def test_desired_tips_that_no_drive_can_keep_up_with(vessel, tmp_path, capsys):
-    (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n")
-    run(capsys, "plan", vessel, "--target", tmp_path / "tips.csv", "-o", tmp_path / "kept-up")
     (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n1.0,43,0\n")
     line = refused(capsys, "plan", vessel, "--target", tmp_path / "tips.csv", "-o", tmp_path / "plan")
     assert "1 s are too few for the 41 mm" in line and "40 mm/s" in line

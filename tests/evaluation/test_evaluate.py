@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from endopilot.cli import main
+from command import output_of, run
 from endopilot.dataset.loader import read_dataset
 from endopilot.devices.robot import read_robot
 from endopilot.errors import InputError
@@ -164,9 +163,7 @@ def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, ca
     metrics = evaluated[1]
     monkeypatch.setattr("endopilot.cli.data.evaluate", lambda *_, **__: metrics)
     monkeypatch.setattr("endopilot.report.report.report_evaluation", lambda _: None)
-    with pytest.raises(SystemExit, match="0"):
-        main(["evaluate", "r", "-o", "out"])
-    printed = capsys.readouterr().out
+    printed = output_of(capsys, "evaluate", "r", "-o", "out")
     assert max(map(len, printed.splitlines())) <= 250
     for sentence in metrics["findings"]:
         assert sentence in printed
@@ -174,9 +171,7 @@ def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, ca
     mae = metrics["splits"]["seen_test"]["tip"]["P2_replayed"]["abscissa"]["30-45"]["mae"]
     assert row.split()[3] == f"{mae:.3f}"
     assert "out/report.html" in printed
-    with pytest.raises(SystemExit, match="0"):
-        main(["evaluate", "r", "-o", "out", "--json"])
-    assert json.loads(capsys.readouterr().out)["splits"].keys() == metrics["splits"].keys()
+    assert run(capsys, "evaluate", "r", "-o", "out")["splits"].keys() == metrics["splits"].keys()
 
 
 def test_controls_pass_the_drives_of_a_robot(toy_dataset):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.cli import main
+from command import output_of, run
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import json_text
@@ -337,12 +337,9 @@ def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, 
     (tmp_path / "hurried.py").write_text(_POLICY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    flags = ["ladder", "--policy", "hurried:Hurried", "--tasks", "straight", "--patients", "1", "--no-page"]
-    with pytest.raises(SystemExit) as leaving:
-        main(flags)
-    assert leaving.value.code == 0
+    words = ["ladder", "--policy", "hurried:Hurried", "--tasks", "straight", "--patients", "1", "--no-page"]
     file = tmp_path / "runs" / "ladder" / "hurried.Hurried" / "submission.json"
-    assert str(file.relative_to(tmp_path)) in capsys.readouterr().out
+    assert str(file.relative_to(tmp_path)) in output_of(capsys, *words)
     content = json.loads(file.read_text(encoding="utf-8"))
     assert content["origin"].startswith("hurried.py sha256:") and _first(content)["exposures"] > 1
     assert check_submission(file, policy="hurried:Hurried").verdict == "decided again"
@@ -352,19 +349,12 @@ def test_a_policy_of_one_s_own_climbs_and_its_submission_is_confirmed(tmp_path, 
     assert check_submission(tmp_path / "forged.json", policy="hurried:Hurried").verdict == "failed"
     Path("hurried.py").unlink()  # the check does not need the policy
     del sys.modules["hurried"]
-    check = ["ladder", "--check", str(file), "--json"]
-    with pytest.raises(SystemExit) as leaving:
-        main(check)
-    assert leaving.value.code == 0
-    checked = json.loads(capsys.readouterr().out)
+    checked = run(capsys, "ladder", "--check", file)
     assert (checked["confirmed"], checked["verdict"]) == (True, "replayed")
     assert "exposures" not in checked["scores"][0]  # nobody can decide again
     _first(content)["seconds"] += 0.5
     file.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(SystemExit) as leaving:
-        main(check)
-    assert leaving.value.code == 1
-    printed = json.loads(capsys.readouterr().out)
+    printed = json.loads(output_of(capsys, "ladder", "--check", file, "--json", code=1))
     assert printed["confirmed"] is False and "seconds is" in printed["difference"]
 
 
