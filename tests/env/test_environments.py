@@ -61,7 +61,7 @@ def test_a_process_that_imported_nothing_makes_environments_by_name():
         "gymnasium.make_vec('endopilot.env:endopilot/Straight-v2', num_envs=2).reset(seed=0)\n"
         "try:\n    gymnasium.make('endopilot/NavigateXray-v0', observation='sonar')\n"
         "except Exception as error:\n"
-        "    assert \"observation: 'sonar'; choose from state, xray, image\" in str(error)\n"
+        "    assert \"observation: 'sonar'; give one of 'state', 'xray', 'image'\" in str(error)\n"
         "else:\n    raise AssertionError\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
