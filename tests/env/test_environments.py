@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
+from endopilot.devices.stack import Stack
 from endopilot.env.observation import (
     CONTROL_PERIOD_S,
     FORCE_REWARD,
@@ -149,7 +150,8 @@ def test_an_anatomy_and_a_target_are_an_environment():
     one, many = NavigateEnv(anatomy, "2"), NavigateVectorEnv(2, anatomy, target="2", patients=1)
     assert one.reset(seed=0)[1] == {name: value[0] for name, value in many.reset(seed=0)[1].items() if name[0] != "_"}
     assert many.navigations[0].target == find_target(anatomy.tree, "2")
-    assert NavigateEnv(anatomy, "2", device="j-035").simulator.set_up.stacks[0].name == "j-035"
+    for device, name in (("j-035", "j-035"), (Stack.of("workhorse-014", "microcatheter-1.7f"), None)):
+        assert NavigateEnv(anatomy, "2", device=device).simulator.set_up.stacks[0].name == (name or device.name)
     with pytest.raises(InputError, match="anatomy, target: give both"):
         NavigateEnv(anatomy)
     with pytest.raises(InputError, match=r"target: 'G1\.2'; the vessel has no such section"):

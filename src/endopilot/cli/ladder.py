@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from endopilot.cli.arguments import Answer
 from endopilot.errors import InputError
 from endopilot.extras import extras_present, require_extras
 from endopilot.ladder.ladder import MISMATCH_FILE, LadderConfig, climb, measure_mismatch
 from endopilot.runs import Existing, OutputFolder
-from endopilot.settings import Within
 
 
 def ladder_command(
     *,
     output: OutputFolder | None = None,
-    mismatch: Annotated[float, Within(0, 1, below_high=True)] = 0.0,
+    mismatch: float = 0.0,
     check: Existing | None = None,
     dataset: Path | None = None,
     table: bool = False,

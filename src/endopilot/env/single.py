@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -32,7 +32,7 @@ class NavigateEnv(gymnasium.Env):
         anatomy: Anatomy | str | Path | None = None,
         target: str | Place | None = None,
         *,
-        render_mode: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
         **given: Any,
     ) -> None:
         """Lay the wire out; `reset` starts the first episode.

@@ -92,7 +92,7 @@ class NavigateVectorEnv(VectorEnv):
         anatomy: Anatomy | str | Path | None = None,
         target: str | Place | None = None,
         *,
-        device: Wire | str | Path | None = None,
+        device: Wire | Stack | str | Path | None = None,
         navigations: Navigation | Sequence[Navigation] | None = None,
         task: str | None = None,
         patient: int = 0,
@@ -116,7 +116,7 @@ class NavigateVectorEnv(VectorEnv):
             num_envs: number of worlds.
             anatomy: a vessel of your own, or its folder.
             target: where the tip is to go in it, as `Anatomy.target` does: a section such as "LAD", or a point.
-            device: the wire in it, its name or its YAML file; `workhorse-014` if not given.
+            device: the wire in it, or a stack; its name or its YAML file; `workhorse-014` if not given.
             navigations: in place of these, one for all worlds, or several, of which world i has number i modulo their
                 number.
             task: in place of them, the name of a task of the ladder.
@@ -156,8 +156,8 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         if anatomy is not None and target is not None:
             vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-            wire = Stack.of(device or "workhorse-014").wire
-            given = [Navigation(anatomy=vessel, device=wire, target=vessel.target(target))]
+            stack, place = Stack.of(device or "workhorse-014"), vessel.target(target)
+            given = [Navigation(anatomy=vessel, device=stack.wire, target=place, catheters=stack.catheters)]
         elif navigations is None:
             ours = task or version != 1
             given = training_navigations(task, patient, patients, version) if ours else [reference_navigation()]

@@ -151,6 +151,8 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
     folder a case. A row for each of `CASES` is returned, and stands in `output`/mismatch.json: over all navigations
     what `score_navigations` gives.
     """
+    if not 0 < share < 1:
+        raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
     if config.world != NOMINAL or config.drawn:
         raise InputError(f"world: {config.world}; mismatch makes worlds of its own and draws none: leave both out")
     make_policy(config.policy)
