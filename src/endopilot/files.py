@@ -255,11 +255,11 @@ def reading(path: Path, mend: str) -> Iterator[None]:
 @contextmanager
 def stored_arrays(path: Path | str, what: str, mend: str) -> Iterator[Any]:
     """Open an .npz file; InputError if it is missing or damaged, or `what` the block takes out of it is not there."""
-    odd = (OSError, ValueError, KeyError, AttributeError, TypeError)
+    damaged = (OSError, ValueError, EOFError, NotImplementedError, BadZipFile, zlib.error)
     try:
         with np.load(regular(path), allow_pickle=False) as stored:
             yield stored
-    except (*odd, BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+    except (*damaged, KeyError, AttributeError, TypeError) as error:
         raise InputError(f"{path}: no {what} ({error}); {mend}") from None
 
 

@@ -13,6 +13,7 @@ from endopilot.devices.device import Device, Wire
 from endopilot.devices.drive_limits import Numbers
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack
+from endopilot.lines import places_on
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection, VesselTree
@@ -45,7 +46,7 @@ class Target:
     def position(self, anatomy: Anatomy) -> Float[np.ndarray, "3"]:
         """Return the target's place on the centerline, LPS mm."""
         line = anatomy.tree.branches[self.branch].centerline
-        return np.array([np.interp(self.abscissa, line.abscissa, axis) for axis in line.points.T])
+        return places_on(line.points, line.abscissa, np.array([self.abscissa]))[0]
 
     def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which worlds have reached it, see `reached`; the tips of each lie along the last axis."""

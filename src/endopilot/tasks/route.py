@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import WIDE_MM
 from endopilot.errors import InputError
+from endopilot.lines import places_on
 from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection, VesselTree
 
@@ -96,7 +97,7 @@ class Route:
 
     def position(self, abscissa: float) -> Float[np.ndarray, "3"]:
         """Return a place on the route, LPS mm."""
-        return np.array([np.interp(abscissa, self.line.abscissa, axis) for axis in self.line.points.T])
+        return places_on(self.line.points, self.line.abscissa, np.array([abscissa]))[0]
 
     def branch(self, abscissa: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
         """Return the index of the branch that the route lies in at some abscissae, mm."""

@@ -299,20 +299,16 @@ class _Comparison:
         return (shares @ flat).reshape(theirs.shape), theirs, max(float(shares @ [1.0, along.mean()]), _WEAKEST)
 
     def residuals(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n"]:
-        """Return how the images differ from what is expected, and the prior's terms: what counts alike is alike."""
+        """Return how far the images are from what is expected, and what is sought from where it was laid, in sd."""
         full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
-        misfit = np.concatenate(
-            [
-                ((ours - theirs) / (strength * full)).ravel()
-                for moment in self.fitted(sought)
-                for ours, theirs, strength in moment
-            ]
-        )
-        less = np.sign(misfit) * np.sqrt(2 * (np.sqrt(1 + misfit**2) - 1))  # the soft L1 loss
-        return np.concatenate([less / self._together(), (sought - self.sought.laid) / self.sought.sd])
+        fitted = [image for moment in self.fitted(sought) for image in moment]
+        off = np.concatenate([((ours - theirs) / (strength * full)).ravel() for ours, theirs, strength in fitted])
+        soft = np.sign(off) * np.sqrt(2 * (np.sqrt(1 + off**2) - 1))  # scipy's loss would soften the prior too
+        return np.concatenate([soft / self._together, (sought - self.sought.laid) / self.sought.sd])
 
+    @property
     def _together(self) -> float:
-        """Return how many times less a pixel says: a Gaussian blur averages 4π times its square, which err together."""
+        """By how much less a pixel tells than one alone: a Gaussian blur makes 4π times its square err together."""
         return np.sqrt(4 * np.pi) * self.blur
 
     def slope(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n k"]:
@@ -325,7 +321,7 @@ class _Comparison:
         """Return the covariance of what fits: what the pixels leave open, with the prior."""
         slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
-        misfit = float(np.sqrt(np.mean(residual[near] ** 2))) * self._together()
+        misfit = float(np.sqrt(np.mean(residual[near] ** 2))) * self._together
         return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
