@@ -259,15 +259,20 @@ def test_the_catheter_arrives_over_its_wire_and_both_tips_are_rewarded(near):
     assert info["catheter_1_tip_abscissa"] > 27.0 and info["tip_abscissa"] < 10.0
 
 
-def test_the_time_limit_truncates_and_the_next_step_begins_anew(near):
-    env = NavigateVectorEnv(WORLDS, navigations=near)
-    env.reset(seed=0)
-    still, steps = np.zeros((WORLDS, 2)), int(np.ceil(near.seconds / CONTROL_PERIOD_S - 1e-9))
+@pytest.mark.parametrize("period_s", [CONTROL_PERIOD_S, 0.5])
+def test_the_time_limit_truncates_and_the_next_step_begins_anew(near, period_s):
+    """And time costs the same, however long a step takes."""
+    env = NavigateVectorEnv(WORLDS, navigations=near, period_s=period_s)
+    still, steps = np.zeros((WORLDS, 2)), int(np.ceil(near.seconds / period_s - 1e-9))
+    far, paid = env.reset(seed=0)[1]["distance_mm"], np.zeros(WORLDS)
     for step in range(steps):
-        _, _, terminations, truncations, infos = env.step(still)
+        _, rewards, terminations, truncations, infos = env.step(still)
+        paid += rewards
         assert not terminations.any()
         assert truncations.all() == (step == steps - 1) == truncations.any()
-    assert infos["time_s"][0] == pytest.approx(steps * CONTROL_PERIOD_S)
+    assert infos["time_s"][0] == pytest.approx(steps * period_s)
+    of_time = STEP_REWARD * steps * period_s / CONTROL_PERIOD_S
+    np.testing.assert_allclose(paid, of_time + PROGRESS_REWARD * (far - infos["distance_mm"]), rtol=1e-6)
     _, rewards, terminations, truncations, infos = env.step(np.ones((WORLDS, 2)))
     assert (rewards == 0).all() and not (terminations | truncations).any() and (infos["time_s"] == 0).all()
     assert np.allclose(infos["inserted_length"], near.start_inserted_length_mm)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import doctest
 import re
 import signal
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,13 +129,10 @@ def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> N
 
 
 def test_groups_that_are_stepped_side_by_side_do_the_same(anatomy: Anatomy) -> None:
-    """That is done where Ctrl-C does not reach: in any but the main thread."""
-    devices = [DEVICE, STIFF] * 9
-    alone, beside = (begun(Simulator(anatomy, devices), 18) for _ in "ab")
+    devices, one = [DEVICE, STIFF] * 9, SimulatorConfig(threads=1)
+    alone, beside = (begun(Simulator(anatomy, devices, config=each), 18) for each in (one, SimulatorConfig()))
     control = controls(1, 18)[0]
-    wanted = alone.step(control, PERIOD)
-    with ThreadPoolExecutor(1) as pool:
-        step = pool.submit(beside.step, control, PERIOD).result()
+    wanted, step = alone.step(control, PERIOD), beside.step(control, PERIOD)
     assert np.array_equal(step.tip_position, wanted.tip_position)
     assert np.array_equal(step.node_iterations, wanted.node_iterations)
 

@@ -175,9 +175,9 @@ def _bounded(values: Float[np.ndarray, "worlds features"]) -> Float[np.ndarray, 
 
 
 CONTROL_PERIOD_S = 2 / 15
-"""Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
+"""Time between two actions if not said, s: fluoroscopy's usual 7.5 frames a second."""
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
-"""A mm nearer to the target, every step, every step with too large a force, and the target."""
+"""A mm nearer to the target, `CONTROL_PERIOD_S` of time, the same with too large a force, and the target."""
 EXPOSURE_REWARD = -0.05
 """Every exposure, where X-ray shows the tip."""
 
@@ -204,15 +204,16 @@ class Episodes:
         safe: worlds whose force has not been too large since their reset.
     """
 
-    def __init__(self, navigations: Sequence[Navigation]) -> None:
-        """Begin with no steps; the navigations are of the same devices."""
+    def __init__(self, navigations: Sequence[Navigation], period_s: float) -> None:
+        """Begin with no steps, each `period_s` long; the navigations are of the same devices."""
+        self.period_s = period_s
         count, self._counted = len(navigations), 1 + navigations[0].arriving
         self.routes = RouteTables.of(navigations)
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
         self._near_mm = np.array([target.near_mm or np.inf for target in targets])
-        self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
+        self._most_steps = np.array([navigation.periods(period_s) for navigation in navigations])
         self.seconds = np.array([navigation.seconds for navigation in navigations])
         self.force_limit_n = np.array([navigation.force_limit_n for navigation in navigations])
         self.steps, self.distance = np.full(count, -1), np.zeros((count, self._counted))
@@ -221,7 +222,7 @@ class Episodes:
     @property
     def time_s(self) -> Float[np.ndarray, "worlds"]:
         """Time since each world's reset, s."""
-        return self.steps * CONTROL_PERIOD_S
+        return self.steps * self.period_s
 
     def begin(self, mask: Bool[np.ndarray, "worlds"], tip: TipProjection) -> None:
         """Start an episode in the worlds of a mask."""
@@ -241,8 +242,8 @@ class Episodes:
         self.safe &= ~unsafe
         success = self._success(now) & going
         nearer = (before - self.distance).sum(axis=1)
-        rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
-        rewards = rewards + EXPOSURE_REWARD * exposed
+        of_time = (STEP_REWARD + FORCE_REWARD * unsafe) * (self.period_s / CONTROL_PERIOD_S)
+        rewards = PROGRESS_REWARD * nearer + of_time + SUCCESS_REWARD * success + EXPOSURE_REWARD * exposed
         terminations = (success | ~now.worlds.valid) & going
         truncations = (self.steps >= self._most_steps) & ~terminations & going
         self.ended = terminations | truncations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -34,7 +34,7 @@ from endopilot.env.observation import (
 )
 from endopilot.env.reality import Reality
 from endopilot.errors import InputError
-from endopilot.settings import public
+from endopilot.settings import Within, public
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -75,8 +75,8 @@ def of_world(observations: Observations, world: int) -> Observations:
 class NavigateVectorEnv(VectorEnv):
     """Bring a guidewire to a target in a vessel tree, in many worlds at once.
 
-    A wire with a bent tip is pushed, pulled and turned at its proximal end, 7.5 times a second. All worlds are stepped
-    by one `Simulator`; a world's course does not depend on the others, to the last bit. What goes in and comes out,
+    A wire with a bent tip is pushed, pulled and turned at its proximal end, every `period_s`. All worlds are stepped by
+    one `Simulator`; a world's course does not depend on the others, to the last bit. What goes in and comes out,
     reward, start, ends, info and arguments are specified in docs/concepts/environments.md.
     """
 
@@ -108,6 +108,7 @@ class NavigateVectorEnv(VectorEnv):
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
         render_mode: Literal["rgb_array"] | None = None,
+        period_s: Annotated[float, Within(0.05, 1.0)] = CONTROL_PERIOD_S,
         max_episode_steps: int | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
@@ -136,6 +137,7 @@ class NavigateVectorEnv(VectorEnv):
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
             config: settings of the rod core.
             render_mode: "rgb_array" lets `render` return pictures.
+            period_s: time between two actions, s; the ladder's policies decide every 0.5 s.
             max_episode_steps: of the registered environment, which Gymnasium hands on; navigations of your own may take
                 fewer steps.
 
@@ -164,7 +166,7 @@ class NavigateVectorEnv(VectorEnv):
         else:
             given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
         given = in_catheter(given, catheter) if catheter else given
-        longest = max((navigation.periods(CONTROL_PERIOD_S) for navigation in given), default=0)
+        longest = max((navigation.periods(period_s) for navigation in given), default=0)
         if max_episode_steps is not None and longest > max_episode_steps:
             raise InputError(
                 f"navigations: take up to {longest} steps, and the registered environment {max_episode_steps}; make "
@@ -175,7 +177,7 @@ class NavigateVectorEnv(VectorEnv):
         every = [given[number % len(given)] for number in range(num_envs)]
         arms = {"config": c_arm or FluoroscopeConfig(), "pixels": pixels if observation == "image" else 0}
         reality = {"world": world, "robot": robot, "motion": motion, "config": config}
-        self._given = (every, observation, AutoresetMode(autoreset_mode), arms, reality)
+        self._given = (every, observation, AutoresetMode(autoreset_mode), arms, reality, period_s)
         self._prepare(*self._given)
         self.render_mode = render_mode
 
@@ -186,6 +188,7 @@ class NavigateVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode,
         arms: dict[str, Any],
         reality: dict[str, Any],
+        period_s: float,
     ) -> None:
         first = navigations[0]
         if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
@@ -199,7 +202,7 @@ class NavigateVectorEnv(VectorEnv):
                 )
         count = len(navigations)
         self.navigations = tuple(navigations)
-        self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode}
+        self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode, "render_fps": 1.0 / period_s}
         self._pictures: dict[int, Picture] = {}
         self.num_envs = count
         self._drives = len(first.devices)
@@ -211,7 +214,7 @@ class NavigateVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, count)
         self._reality = Reality(navigations, **reality)
         self._simulator = self._reality.simulator
-        self._episodes = Episodes(navigations)
+        self._episodes = Episodes(navigations, period_s)
         self._c_arms = None if observation == "state" else CArms(navigations, self._simulator, **arms)
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
@@ -262,7 +265,7 @@ class NavigateVectorEnv(VectorEnv):
         control = np.minimum(np.maximum(control[:, : 2 * self._drives], -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
         control = control.reshape(self.num_envs, self._drives, 2)
-        step = self._reality.drive(control, CONTROL_PERIOD_S, episodes.time_s)
+        step = self._reality.drive(control, episodes.period_s, episodes.time_s)
         now = self._now(step)
         episodes.steps += ~fresh
         self._expose(expose)

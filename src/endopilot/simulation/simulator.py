@@ -35,7 +35,7 @@ _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _STATE_FORMAT = 4  # of `SimulatorState`: raised when its values come to mean something else
 _PACK = 8  # worlds that count as stepped together, however many the processor steps: a budget buys the same on each
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
-_AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds, but not the main thread's: Ctrl-C stops a step there
+_AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds; the main thread's long runs are left to Ctrl-C, though
 
 
 class Simulator(Readout):
@@ -383,7 +383,8 @@ class Simulator(Readout):
     ) -> dict[str, np.ndarray]:
         """Step all worlds; from now on they are on their way."""
         run = partial(self._run, time_step=time_step, steps=steps, shape=record_shape, advance=advance)
-        one_by_one = self.config.threads == 1 or threading.current_thread() is threading.main_thread()
+        in_main = threading.current_thread() is threading.main_thread()
+        one_by_one = self.config.threads == 1 or (in_main and control.shape[1] > 1)
         each = map if one_by_one or len(self._groups) == 1 else _AT_ONCE.map
         results = list(each(run, self._groups, [control[group.index] for group in self._groups]))
         if control.size and not np.isnan(self._set_up.initial).all():
