@@ -84,6 +84,19 @@ def here():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def refusals():
+    """Let no refusal have two lines: the command line prints each in one."""
+    from endopilot.errors import InputError
+
+    def begin(self, *message):
+        assert not any("\n" in str(part) for part in message), message
+        Exception.__init__(self, *message)
+
+    with patch.object(InputError, "__init__", begin):
+        yield
+
+
 @pytest.fixture
 def in_processes(monkeypatch):
     """Let work on several items be done in processes of their own, as for users."""

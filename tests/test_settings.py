@@ -206,9 +206,7 @@ def test_every_number_has_a_range_and_refuses_what_lies_outside(kind, field, pla
     for value in bad:
         with pytest.raises(InputError) as error:
             kind(**others, **{field: put(value)})
-        line = str(error.value)
-        assert line.startswith(f"{place}: {value!r}; give a "), line
-        assert "\n" not in line
+        assert str(error.value).startswith(f"{place}: {value!r}; give a ")
 
 
 ONE_OF_TWO = {"CArmCamera": {"angles_deg": (0.0, 0.0), "isocenter_mm": (0.0, 0.0, 0.0), "centre_px": (256.0, 256.0)}}

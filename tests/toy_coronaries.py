@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -15,9 +16,10 @@ LEFT_FROM_RIGHT_MM = np.array([12.0, 30.0, 13.0])
 PLACE_MM = {"rca": np.zeros(3), "lca": LEFT_FROM_RIGHT_MM}
 
 
-def artery(vessel, index=0, seed=5):
-    """A synthetic artery whose ostium lies at `PLACE_MM`: the true ostium, and its distance map."""
-    tree, _ = make_patient_tree(AtlasConfig(vessel=vessel, seed=seed), index)
+@cache
+def artery(vessel):
+    """The distance map of a synthetic artery whose ostium lies at `PLACE_MM`."""
+    tree, _ = make_patient_tree(AtlasConfig(vessel=vessel, seed=5), 0)
     lumen = distance_map_from_spheres(tree, spacing_mm=VOXEL_MM)
     shift = PLACE_MM[vessel] - tree.branches[0].centerline.points[0]
     return replace(lumen, origin_mm=lumen.origin_mm + shift)

@@ -60,7 +60,8 @@ def test_the_tree_begins_at_the_found_ostium_and_the_record_says_how_sure_it_is(
     def left_or_near(points):
         return (np.linalg.norm(points, axis=1) < 28) | ((points[:, 1] > 15) & (points[:, 0] > 10))
 
-    anatomy = extract_anatomy(without(both, left_or_near), name="patient", config=AnatomyConfig(vessel="rca"))
+    config = AnatomyConfig(vessel="rca", spacing_mm=2.0)
+    anatomy = extract_anatomy(without(both, left_or_near), name="patient", config=config)
     assert np.linalg.norm(anatomy.insertion.position) < 4.0
     assert anatomy.provenance["ostium_rule"] == "shape of the coronary arteries"
     assert 0.9 < anatomy.provenance["ostium_confidence"] <= 1.0
@@ -275,5 +276,6 @@ def test_arteries_that_touch_are_told_as_that_and_the_place_advised_is_an_ostium
     assert "--vessel" not in str(refused.value)
     advised = re.search(r"or --ostium-mm (-?\d+\.\d) (-?\d+\.\d) (-?\d+\.\d)", str(refused.value))
     place = tuple(float(value) for value in advised.groups())
-    anatomy = extract_anatomy(mask, name="mask", config=AnatomyConfig(vessel="lca", ostium_mm=place))
+    config = AnatomyConfig(vessel="lca", ostium_mm=place, spacing_mm=2.0)
+    anatomy = extract_anatomy(mask, name="mask", config=config)
     assert np.linalg.norm(anatomy.insertion.position - PLACE_MM["lca"]) < 4.0

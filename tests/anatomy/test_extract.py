@@ -88,13 +88,6 @@ def test_fork_is_found_with_its_root(fork_mask):
     assert np.linalg.norm(place) < 1.5
 
 
-def test_given_ostium_is_the_root_and_mid_vessel_ostium_points_distally(fork_mask):
-    side_tip = forked_tree().branches[2].centerline.points[-1] - [0, 0, 20]
-    anatomy = extract_anatomy(fork_mask, name="x", config=AnatomyConfig(ostium_mm=tuple(side_tip)))
-    assert np.linalg.norm(anatomy.insertion.position - side_tip) < 2.0
-    assert anatomy.provenance["ostium_rule"] == "given"
-
-
 def test_the_tree_begins_at_the_ostium_that_the_segmentation_found(fork_mask):
     ostium = Insertion(np.array([0.5, -0.4, -17.0]), np.array([0.0, 0.0, 1.0]))
     anatomy = extract_anatomy(LumenMask(fork_mask.volume, ostium), name="fork")
@@ -151,12 +144,12 @@ CUBE = (36, 36, 36)
         (np.ones(CUBE, dtype=bool), "solid block"),
         (np.linalg.norm(np.indices(CUBE) - 18, axis=0) < 15, "no vessel"),
         (np.random.default_rng(0).random(CUBE) < 0.4, "noise"),
+        (np.all(np.indices(CUBE)[:2] == 18, axis=0), "one voxel|nowhere thick"),
     ],
 )
 def test_what_is_no_vessel_is_refused(voxels, message):
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(InputError, match=message):
         extract_anatomy(LumenMask(Volume(voxels, np.full(3, 0.5), np.zeros(3), np.eye(3))), name="bad")
-    assert "\n" not in str(error.value)
 
 
 def test_mask_away_from_the_ostium_is_refused(fork_mask):
@@ -169,8 +162,8 @@ def test_real_patient_comes_back_from_the_rebuilt_lumen():
     truth = extract_anatomy(read_source(REAL / "rca_cl.vtp"), name="rca", config=AnatomyConfig(vessel="rca"))
     assert len(truth.tree.leaves()) == 4 and is_sound(truth)
     assert truth.tree.branches[0].centerline.radius.max() < 4  # cut at the ostium, where the aorta ends
-    lumen = distance_map_from_spheres(truth.tree, spacing_mm=0.4)
-    mask = LumenMask(Volume(lumen.values > 0, np.full(3, 0.4), lumen.origin_mm, np.eye(3)), truth.insertion)
+    lumen = distance_map_from_spheres(truth.tree, spacing_mm=0.5)
+    mask = LumenMask(Volume(lumen.values > 0, np.full(3, 0.5), lumen.origin_mm, np.eye(3)), truth.insertion)
     found = extract_anatomy(mask, name="again", config=AnatomyConfig(vessel="rca"))
     assert is_sound(found)
     one, two = (
@@ -216,6 +209,7 @@ def test_an_ostium_in_mid_vessel_points_away_from_the_inlet():
     mask = mask_of(narrowing, (5, 5, 36), VOXEL_MM)
     anatomy = extract_anatomy(mask, name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 5.0)))
     assert len(anatomy.tree.branches) == 1 and anatomy.insertion.direction[2] < -0.9
+    assert anatomy.provenance["ostium_rule"] == "given" and abs(anatomy.insertion.position[2] - 5.0) < 1.0
     assert abs(anatomy.tree.longest_path().abscissa[-1] - 35) < 3
 
 
@@ -239,12 +233,6 @@ def test_the_other_side_of_a_wide_inlet_is_no_branch_that_leads_back():
     assert np.abs(tip.abscissa - (up[:, 2] + 20)).max() < 1.5  # a wire in the web lies beside the line, not far ahead
     # The radius is the vessel's and not the distance to the cut.
     assert anatomy.tree.branches[0].centerline.radius.min() > 1.2
-
-
-def test_a_vessel_of_one_voxel_is_refused_with_the_reason():
-    mask = mask_of(lambda p: tube(p, 0.125, -9, 9, 0.13), (2, 2, 10), (0.25, 0.25, 0.25))
-    with pytest.raises(InputError, match=r"one voxel|nowhere thick"):
-        extract_anatomy(mask, name="thin")
 
 
 def test_a_batch_makes_the_good_and_lists_the_bad(fork_mask, tmp_path):
@@ -275,25 +263,11 @@ def test_a_branch_begins_on_its_parents_axis_at_the_fork():
 HALF_MM = (22.0, 12.0, 34.0)
 
 
-def two_arteries(points):
-    return np.maximum(tube(points, -10.0, -20.0, 30.0), tube(points, 10.0, -30.0, 30.0))
-
-
 def artery_from_aorta(points):
     """A vessel that leaves a ball of 9 mm radius around (0, 0, 22); a bulge of 4 mm stands 20 mm below its end."""
     aorta = 9.0 - np.linalg.norm(points - [0.0, 0.0, 22.0], axis=-1)
     bulge = 4.0 - np.linalg.norm(points - [0.0, 0.0, -12.0], axis=-1)
     return np.maximum.reduce([tube(points, 0.0, -32.0, 30.0), aorta, bulge])
-
-
-def test_of_two_vessels_the_larger_is_taken_and_the_other_named():
-    mask = mask_of(two_arteries, HALF_MM, (0.6, 0.6, 0.6))
-    for source in (mask, surface_from_mask(mask.volume)):
-        anatomy = extract_anatomy(source, name="both")
-        assert abs(anatomy.insertion.position[0] - 10.0) < 1.0
-        assert any("another vessel apart from the lumen" in note for note in anatomy.provenance["notes"])
-    with pytest.raises(InputError, match="--ostium-mm"):  # straight tubes are not answered as coronary arteries
-        extract_anatomy(mask, config=AnatomyConfig(vessel="rca"))
 
 
 def test_coronary_ostium_is_where_the_vessel_leaves_the_aorta():

@@ -43,7 +43,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "_Worker", Here)
 
 
-def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path, in_this_process) -> None:
     measured = measure_robustness(small(tmp_path / "run"))
     figures = {row["figure"]: row for row in measured["figures"]}
     assert measured["rollouts"] == 20

@@ -28,7 +28,7 @@ from endopilot.simulation.motion import motion_named
 from endopilot.simulation.trajectory import Trajectory
 
 WORLDS, SAMPLES = 2, 4
-CONVERGED = SimulatorConfig(element_mm=0.5, time_step_s=0.01, tolerance_mm=1e-6)
+CONVERGED = SimulatorConfig(element_mm=0.6, time_step_s=0.0125, tolerance_mm=1e-6)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,7 +42,7 @@ def patients() -> Iterator[None]:
 def made(patients: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Trajectory]]:
     """Return a small reference, and the rollouts that it holds."""
     path = tmp_path_factory.mktemp("reference") / "small.npz"
-    finer, rollouts, run = replace(CONVERGED, element_mm=0.4), [], Scene.run
+    finer, rollouts, run = replace(CONVERGED, element_mm=0.5), [], Scene.run
 
     def kept(*args: Any) -> Trajectory:
         rollouts.append(run(*args))

@@ -171,10 +171,8 @@ def test_patients_are_those_of_no_task_and_of_one_set():
     assert worlds.navigation_at("test", 7)[2] == 1000 * 20002 + 1
 
 
-def test_trials_before_a_fork_pass_on_some_sides_and_not_on_others(fork, wire) -> None:
-    shaped = replace(wire.with_tip(bend_rad=np.deg2rad(70.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
-    navigation = Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=40.0)
-    rows = Forks(navigation, np.random.default_rng(0)).drive()
+def test_trials_before_a_fork_pass_on_some_sides_and_not_on_others(side_branch) -> None:
+    rows = Forks(side_branch, np.random.default_rng(0)).drive()
     view, azimuth, passed = (np.array(column) for column in zip(*rows, strict=True))
     assert view.shape == (len(rows), FEATURES) and azimuth.shape == passed.shape == (len(rows), TURNS)
     before_fork = passed[0]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from endopilot.types import LumenMask, Volume
+from endopilot.types import Volume
 
 
 def line(*corners: Sequence[float]) -> np.ndarray:
@@ -66,11 +66,6 @@ def with_voxels(mask: Volume, start: Sequence[float], end: Sequence[float]) -> V
     index = np.unique(np.rint(mask.world_to_index(along)).astype(int), axis=0)
     voxels[tuple(index[:, ::-1].T)] = True
     return Volume(voxels, mask.spacing_mm, mask.origin_mm, mask.direction)
-
-
-def lumen(mask: Volume) -> LumenMask:
-    """Return the mask as what segmentation gives."""
-    return LumenMask(mask)
 
 
 def length_of(anatomy) -> float:

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from make_meshes import tube
-from make_vessels import hairpin, length_of, line, lumen, thinned_at, tubes, with_voxels
+from make_vessels import hairpin, length_of, line, thinned_at, tubes, with_voxels
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.tree import sampled
-from endopilot.types import Volume
+from endopilot.errors import InputError
+from endopilot.types import LumenMask, Volume
 from endopilot.vessels.medial_lines import traced_lines
 from endopilot.vessels.remarks import NOTED_MM
 from endopilot.vessels.surface import Surface, surface_from_mask
@@ -42,7 +43,7 @@ def test_a_hairpin_that_touches_itself_is_parted_and_keeps_its_length_and_its_ro
     for up, aside in np.ndindex(2, 2):
         place = aside * voxel_mm[1], 20 + up * voxel_mm[2]
         mask = with_voxels(mask, (-1.2, *place), (1.2, *place))
-    anatomy = extract_anatomy(lumen(mask), name="hairpin")
+    anatomy = extract_anatomy(LumenMask(mask), name="hairpin")
     assert anatomy.insertion.position[2] < 2.0 and len(anatomy.tree.branches) == 1
     assert length_of(anatomy) > 104
     assert PARTED in notes_of(anatomy)
@@ -60,13 +61,13 @@ CROSSING = [(line((0, 0, -28), (0, 0, 28)), 1.9), (line((3.0, -20, -20), (3.0, 2
 
 
 def test_a_bypass_is_cut_at_its_narrowest_place_and_the_place_is_stated():
-    anatomy = extract_anatomy(lumen(tubes(*BYPASS, voxel_mm=VOXELS[1])), name="bypass")
+    anatomy = extract_anatomy(LumenMask(tubes(*BYPASS, voxel_mm=VOXELS[1])), name="bypass")
     assert length_of(anatomy) > 95.0 and PARTED in notes_of(anatomy)
 
 
 def test_two_vessels_that_touch_in_passing_are_parted():
     vessels = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (line((4.6, -30, 30), (4.6, 30, 30)), 1.6))
-    anatomy = extract_anatomy(lumen(with_voxels(vessels, (1.0, 0, 30), (3.6, 0, 30))), name="passing")
+    anatomy = extract_anatomy(LumenMask(with_voxels(vessels, (1.0, 0, 30), (3.6, 0, 30))), name="passing")
     assert len(anatomy.tree.branches) == 1 and abs(length_of(anatomy) - 60) < 3
     assert PARTED in notes_of(anatomy) and abs(places_of(anatomy)[0][0] - 2.0) <= 0.5
     assert re.search(r"another vessel that touches this one left out .* 6[23] mm long", notes_of(anatomy))
@@ -86,7 +87,7 @@ def test_two_vessels_that_touch_along_their_walls_are_never_one_tree_unsaid(angl
     other = 24.0 * np.array([0.0, np.sin(turn), np.cos(turn)])
     aside = np.array([1.9 + 1.5 - overlap_mm, 0, 0])
     mask = tubes((one, 1.9), (line(aside - other, aside + other), 1.5), voxel_mm=(0.5, 0.5, 0.5))
-    anatomy = extract_anatomy(lumen(mask), name="touching")
+    anatomy = extract_anatomy(LumenMask(mask), name="touching")
     assert "the lumen touches" in notes_of(anatomy) and any(
         np.linalg.norm(place - [1.9, 0, 0]) < 3.0 for place in places_of(anatomy)
     )
@@ -98,7 +99,7 @@ def test_two_vessels_that_touch_along_their_walls_are_never_one_tree_unsaid(angl
 def test_a_fork_keeps_all_its_branches_and_is_not_called_a_contact(angles):
     arms = [(line((0, 0, 0), 30.0 * np.array([np.sin(a), 0.1, np.cos(a)])), 1.3) for a in np.radians(angles)]
     mask = tubes((line((0, 0, -30), (0, 0, 0)), 1.9), *arms, voxel_mm=(0.5, 0.5, 0.5))
-    anatomy = extract_anatomy(lumen(mask), name="fork")
+    anatomy = extract_anatomy(LumenMask(mask), name="fork")
     assert length_of(anatomy) > 0.9 * 30 * (1 + len(angles)) and "touch" not in notes_of(anatomy)
 
 
@@ -113,7 +114,7 @@ def flap(tears: int, at_mm: float, end_mm: float) -> Volume:
 
 
 def test_a_line_goes_through_the_tears_of_a_flap_which_takes_nothing_away():
-    anatomy = extract_anatomy(lumen(flap(4, at_mm=15.0, end_mm=114.0)), name="tears")
+    anatomy = extract_anatomy(LumenMask(flap(4, at_mm=15.0, end_mm=114.0)), name="tears")
     narrowest = min(branch.centerline.radius.min() for branch in anatomy.tree.branches)
     assert narrowest > 0.3  # mm; the wall is 1.2 mm thick
     assert "apart from the lumen" not in notes_of(anatomy) and LEFT in notes_of(anatomy)
@@ -131,12 +132,16 @@ def test_no_cut_of_a_loop_takes_vessel_away():
 
 def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
     pieces = [(line((20.0 * i, 0, 0), (20.0 * i, 0, 60 - 15 * i)), 1.5) for i in range(3)]
-    anatomy = extract_anatomy(lumen(tubes(*pieces)), name="pieces")
-    told = "apart from the lumen, which --ostium-mm chooses, left out"
-    left = [note for note in anatomy.provenance["notes"] if told in note]
-    assert len(left) == 2 and "at (19.0, " in left[0] and "at (39.0, " in left[1]
+    mask, told = tubes(*pieces), "apart from the lumen, which --ostium-mm chooses, left out"
+    for source in (surface_from_mask(mask), LumenMask(mask)):
+        anatomy = extract_anatomy(source, name="pieces")
+        left = [note for note in anatomy.provenance["notes"] if told in note]
+        assert len(left) == 2 and abs(anatomy.insertion.position[0]) < 1.0  # the longest is taken
+    assert "at (19.0, " in left[0] and "at (39.0, " in left[1]
+    with pytest.raises(InputError, match="--ostium-mm"):  # straight tubes are not answered as coronary arteries
+        extract_anatomy(LumenMask(mask), config=AnatomyConfig(vessel="rca"))
     config = AnatomyConfig(ostium_mm=(0.0, 0.0, 30.0))
-    assert "of the lumen behind the ostium" in notes_of(extract_anatomy(lumen(tubes(*pieces[:1])), config=config))
+    assert "of the lumen behind the ostium" in notes_of(extract_anatomy(LumenMask(tubes(*pieces[:1])), config=config))
 
 
 STRAIGHT = line((0, 0, 0), (0, 0, 60))
@@ -152,14 +157,14 @@ STRAIGHT = line((0, 0, 0), (0, 0, 60))
 )
 def test_a_vessel_goes_on_behind_a_neck(voxel_mm, radius_mm, length_mm, across, widened):
     mask = thinned_at(tubes((STRAIGHT, radius_mm), voxel_mm=voxel_mm), (0.1, 0.1, 30), length_mm, across)
-    anatomy = extract_anatomy(lumen(mask), name="neck")
+    anatomy = extract_anatomy(LumenMask(mask), name="neck")
     assert abs(length_of(anatomy) - 60.0) < 2.0
     assert "a neck of" in notes_of(anatomy) or not widened
 
 
 def test_a_branch_of_one_voxel_is_followed():
     trunk = tubes((STRAIGHT, 1.6), (line((0, 0, 30), (22, 0, 45)), 0.01), voxel_mm=VOXELS[1])
-    anatomy = extract_anatomy(lumen(with_voxels(trunk, (0, 0, 30), (22, 0, 45))), name="twig")
+    anatomy = extract_anatomy(LumenMask(with_voxels(trunk, (0, 0, 30), (22, 0, 45))), name="twig")
     tips = [anatomy.tree.branches[leaf].centerline.points[-1] for leaf in anatomy.tree.leaves()]
     assert np.linalg.norm(np.array(tips) - [22, 0, 45], axis=1).min() < 2.5
     assert "a thin branch of" in notes_of(anatomy)
@@ -189,7 +194,7 @@ def test_what_is_reached_and_what_is_stated_are_all_of_the_piece(branches, necks
     mask = tubes(*lines, voxel_mm=voxel_mm)
     for height, length, across in necks:
         mask = thinned_at(mask, (0, 0, height), length, across)
-    anatomy = extract_anatomy(lumen(mask), name="random")
+    anatomy = extract_anatomy(LumenMask(mask), name="random")
     notes = " ".join(anatomy.provenance["notes"])
     balance = anatomy.provenance["coverage"]
     parts = balance["reached_mm"] + balance["widened_mm"] + balance["left_out_mm"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from make_fuzz import bounded
+from make_fuzz import bounded, read_or_refused, refusal
 
 from endopilot.control.plan import read_tips
 from endopilot.errors import InputError, Remark
@@ -32,11 +32,7 @@ def read(tmp_path: Path, content: str | bytes, **options: int) -> tuple[Scripted
 
 
 def refused(tmp_path: Path, content: str | bytes, **options: int) -> str:
-    with pytest.raises(InputError) as error:
-        read(tmp_path, content, **options)
-    line = str(error.value)
-    assert line.startswith(f"{tmp_path / 'controls.csv'}: ") and "\n" not in line
-    return line.partition(": ")[2]
+    return refusal(tmp_path / "controls.csv", content, lambda path: read_controls_csv(path, **options))
 
 
 @pytest.mark.parametrize(
@@ -184,25 +180,6 @@ ODD = ["0.5", "1.0", "1.5", "0", "", "nan", "1e400", "0,5", '"', "x", " 2 ", "1_
 CELLS = st.sampled_from(ODD) | NUMBERS.map(str)
 
 
-def outcome(path: Path, content: str | bytes, devices: int = 1) -> ScriptedControls | None:
-    """Return what a file is read as; None where one line refuses it."""
-    path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
-    found = None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for read in (lambda: read_controls_csv(path, devices=devices), lambda: read_tips(path, 40.0, 2.0)):
-            try:
-                found = read() if found is None else found
-            except InputError as error:
-                line = str(error)
-                assert line.startswith(str(path)) and "\n" not in line and len(line) < 1500, line
-    if isinstance(found, ScriptedControls):
-        assert np.isfinite(found.control).all() and np.isfinite(found.initial).all()
-        assert PERIODS_S[0] <= found.period_s <= PERIODS_S[1]
-        return found
-    return None
-
-
 @BOUNDED
 @given(
     header=st.lists(st.sampled_from(NAMES), max_size=7),
@@ -212,4 +189,11 @@ def outcome(path: Path, content: str | bytes, devices: int = 1) -> ScriptedContr
     devices=st.integers(1, 3),
 )
 def test_any_cells(tmp_path, header, rows, separator, end, devices) -> None:
-    outcome(tmp_path / "c.csv", end.join(separator.join(row) for row in (header, *rows)), devices)
+    content = end.join(separator.join(row) for row in (header, *rows))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = read_or_refused(tmp_path / "c.csv", content, lambda path: read_controls_csv(path, devices=devices))
+        read_or_refused(tmp_path / "c.csv", content, lambda path: read_tips(path, 40.0, 2.0))
+    if found is not None:
+        assert np.isfinite(found.control).all() and np.isfinite(found.initial).all()
+        assert PERIODS_S[0] <= found.period_s <= PERIODS_S[1]

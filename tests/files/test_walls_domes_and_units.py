@@ -68,9 +68,9 @@ def test_lines_into_a_dome_begin_at_the_vessel_inlet():
 @pytest.mark.parametrize(("ends", "kind"), [("both open", "mask"), ("one open", "surface"), ("closed", "mask")])
 def test_the_lumen_of_a_wall_is_taken(ends, kind):
     lines = [(line((0, 0, 0), (2, 1, 25), (0, 0, 50)), 2.6), (line((2, 1, 25), (20, 4, 40)), 1.9)]
-    whole = tubes(*[(points, radius + 1.5) for points, radius in lines])
+    whole = tubes(*[(points, radius + 1.5) for points, radius in lines], voxel_mm=(0.6, 0.6, 0.6))
     lumen = np.zeros_like(whole.voxels)
-    inner = tubes(*lines)
+    inner = tubes(*lines, voxel_mm=(0.6, 0.6, 0.6))
     corner = np.rint((inner.origin_mm - whole.origin_mm) / whole.spacing_mm).astype(int)[::-1]
     lumen[tuple(slice(a, a + n) for a, n in zip(corner, inner.voxels.shape, strict=True))] = inner.voxels
     wall = Volume(whole.voxels & ~lumen, whole.spacing_mm, whole.origin_mm, whole.direction)
@@ -86,7 +86,7 @@ def test_the_lumen_of_a_wall_is_taken(ends, kind):
 
 
 def test_closed_tubes_that_overlap_are_one_vessel():
-    parts = [surface_from_mask(tubes((points, radius))) for points, radius in (
+    parts = [surface_from_mask(tubes((points, radius), voxel_mm=(0.6, 0.6, 0.6))) for points, radius in (
         (line((0, 0, 0), (0, 0, 50)), 2.5), (line((0, 0, 20), (18, 0, 38)), 1.6), (line((0, 0, 35), (-15, 3, 48)), 1.5),
     )]  # fmt: skip
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from endopilot.errors import InputError
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Volume
-
-CTA = Path(__file__).parents[3] / "shared" / "data" / "cta_thorax" / "cta_thorax_1p5mm.nii.gz"
 
 AORTA_RADIUS_MM, ARC_MM = 13.0, 18.0
 
@@ -36,7 +33,7 @@ def _branch() -> np.ndarray:
 @pytest.fixture(scope="module")
 def heart():
     """Return the scan of an aorta with two coronary arteries, a dim vein and a chamber close by, and the right tree."""
-    grid = empty_grid((120, 100, 150), (0.5, 0.5, 0.6), (-25.0, -28.0, -46.0))
+    grid = empty_grid((103, 84, 125), (0.6, 0.6, 0.7), (-25.0, -28.0, -46.0))
     x = positions(grid)
     centre = np.array([0.6, 0.8]) * AORTA_RADIUS_MM
     aorta = np.hypot(x[..., 0] - centre[0], x[..., 1] - centre[1]) < AORTA_RADIUS_MM
@@ -113,17 +110,17 @@ def test_a_volume_cut_off_at_zero_is_segmented_with_seeds_and_one_that_lost_its_
 
 def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):
     volume, _ = heart
-    bottom = Volume(volume.voxels[:70], volume.spacing_mm, volume.origin_mm, volume.direction)
+    bottom = Volume(volume.voxels[:60], volume.spacing_mm, volume.origin_mm, volume.direction)
     lower = segment(bottom, config=SegmentConfig(seeds=(tuple(_axis()[70]),)))
     assert lower.ostium is not None
     assert np.linalg.norm(lower.ostium.position - _axis()[70]) < 2.5
     inside = (positions(bottom) - lower.ostium.position) @ lower.ostium.direction > 1.0
-    assert dice(lower.volume.voxels & inside, right_tree.volume.voxels[:70] & inside) > 0.85
+    assert dice(lower.volume.voxels & inside, right_tree.volume.voxels[:60] & inside) > 0.85
 
 
 def test_voxels_too_coarse_for_coronary_arteries_are_refused_with_their_size(heart):
     thick = Volume(heart[0].voxels[::3], heart[0].spacing_mm * [1.0, 1.0, 3.0], heart[0].origin_mm, heart[0].direction)
-    with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.8 mm; 1.25 mm at most\)"):
+    with pytest.raises(InputError, match=r"too coarse for coronary arteries \(2.1 mm; 1.25 mm at most\)"):
         segment(thick, config=SegmentConfig(seeds=((0.0, 0.0, 0.0),)))
 
 
@@ -169,7 +166,7 @@ def test_a_stump_is_no_coronary_tree(heart):
 @pytest.fixture(scope="module")
 def two_trunks():
     """Return an aorta with an artery, and a pulmonary trunk: as bright, wider, and the artery passes 2 mm in front."""
-    grid = empty_grid((90, 130, 108), (0.6, 0.6, 0.6), (-20.0, -50.0, -36.0))
+    grid = empty_grid((72, 104, 87), 0.75, (-20.0, -50.0, -36.0))
     x = positions(grid)
     aorta, trunk = (
         np.hypot(x[..., 0] - middle[0], x[..., 1] - middle[1]) - radius

@@ -21,8 +21,8 @@ from endopilot.phantom.scanner import scan
 from endopilot.types import Branch, VesselTree
 
 CLEAN = PhantomConfig(
-    in_plane_mm=0.5,
-    slice_mm=0.6,
+    in_plane_mm=0.6,
+    slice_mm=0.8,
     lumen_hu=(400.0, 400.0),
     noise_hu=(0.0, 0.0),
     psf_mm=(0.5, 0.5),

@@ -1,4 +1,4 @@
-"""The vessel of most of these tests."""
+"""The vessels of most of these tests."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ def anatomy():
 
 
 @pytest.fixture(scope="session")
-def bend(anatomy):
-    """Return the same tube."""
-    return anatomy
+def vessel():
+    """Return a synthetic right coronary artery; do not write into it."""
+    from endopilot.atlas.atlas import AtlasConfig, make_patient
+
+    return make_patient(AtlasConfig(), 0)

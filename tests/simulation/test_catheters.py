@@ -19,11 +19,6 @@ from endopilot.types import Anatomy
 
 
 @pytest.fixture(scope="module")
-def vessel() -> Anatomy:
-    return next(iter(endopilot.make_atlas(config=endopilot.AtlasConfig())))
-
-
-@pytest.fixture(scope="module")
 def catheter() -> Catheter:
     return read_catheter("microcatheter-1.7f")
 

@@ -117,14 +117,6 @@ def test_a_breath_does_not_move_the_wire_in_its_vessel(anatomy: Anatomy) -> None
     assert np.linalg.norm(place(moving.vessel_to_laboratory, at) - at, axis=-1).max() > 4
 
 
-def test_a_contracting_vessel_loads_the_wire(anatomy: Anatomy) -> None:
-    initial, control = drives(3, 6)
-    still = simulate(anatomy, DEVICE, control, initial=initial)
-    moving = simulate(anatomy, DEVICE, control, initial=initial, motion=BEATS)
-    assert moving.valid.all()
-    assert np.abs(moving.tip.abscissa - still.tip.abscissa).max() > 0.5
-
-
 def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:
     write_anatomy(anatomy, output=tmp_path / "bend")
     random = command.RandomConfig(sequences=2, seconds=2.0)

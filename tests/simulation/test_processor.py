@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,6 @@ from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
-ROOT = Path(__file__).parents[2]
 DEVICE = read_wire("workhorse-014")
 GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
 CPU = SimulatorConfig(element_mm=1.5)

@@ -37,13 +37,15 @@ class SetUp:
 
     stack: Stack
     config: SimulatorConfig = COARSE
+    period_s: float = 0.5
     options: dict[str, Any] = field(default_factory=dict)
 
     def simulated(self, worlds: Any, **changed: Any) -> Trajectory:
         """Return the trajectories of some worlds, simulated with nobody else."""
         initial, control = self.drives()
         config = replace(self.config, **changed)
-        return simulate(VESSEL, self.stack, control[worlds], initial=initial[worlds], config=config, **self.options)
+        drives = {"initial": initial[worlds], "period_s": self.period_s}
+        return simulate(VESSEL, self.stack, control[worlds], **drives, config=config, **self.options)
 
     def simulator(self) -> Simulator:
         return Simulator(VESSEL, self.stack, worlds=WORLDS, config=self.config, **self.options)
@@ -62,6 +64,7 @@ VESSEL = bend.vessel()
 SET_UPS = {
     "wire": SetUp(Stack(WIRE), SimulatorConfig()),
     "weak drive": SetUp(Stack(WEAK)),
+    "steps of another length": SetUp(Stack(WIRE), period_s=0.06),  # no multiple of the time step
     "loads": SetUp(Stack(WIRE), options={"actuation": "force"}),
     "compliant wall": SetUp(Stack(STIFF), replace(COARSE, compliant_wall_n_mm2=0.01)),
     "friction along": SetUp(Stack(WIRE), replace(COARSE, friction_along=(1.0, 4.0))),
@@ -82,6 +85,7 @@ def made(request: pytest.FixtureRequest) -> tuple[str, SetUp, Trajectory]:
 
 def test_in_any_company_and_by_any_number_of_threads(made: tuple[str, SetUp, Trajectory]) -> None:
     name, set_up, whole = made
+    assert whole.period_s == set_up.period_s
     if name == "weak drive":
         assert (whole.slip > 0.1).any() and (np.abs(whole.rotation_slip) > 0.1).any()
     if "catheter" in name:  # wire and catheter overtake each other
@@ -104,7 +108,7 @@ def test_step_by_step_and_from_a_state_written_on_the_way(made: tuple[str, SetUp
             simulator.state.write(tmp_path / "state.npz")
             simulator = set_up.simulator()
             simulator.set_state(SimulatorState.read(tmp_path / "state.npz"))
-        step = simulator.step(control[:, sample], 0.5)
+        step = simulator.step(control[:, sample], set_up.period_s)
         for each in ("tip_position", "tip_direction", "contact_force_max", "wall_force", "slip", "rotation_slip"):
             np.testing.assert_array_equal(getattr(step, each), getattr(whole, each)[:, sample], err_msg=each)
         np.testing.assert_array_equal(simulator.base_load[..., 0], whole.base_force[:, sample])
@@ -118,7 +122,7 @@ def test_step_by_step_and_from_a_state_written_on_the_way(made: tuple[str, SetUp
         assert (simulator.drive_rotation != simulator.rotation).any()
 
 
-@pytest.mark.parametrize("name", [name for name in SET_UPS if name != "wire"])
+@pytest.mark.parametrize("name", [name for name in SET_UPS if name not in ("wire", "steps of another length")])
 def test_a_state_of_another_set_up_is_refused(name: str) -> None:
     state = SET_UPS[name].simulator().state
     with pytest.raises(InputError, match="state: made with other"):

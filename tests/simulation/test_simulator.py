@@ -1,4 +1,4 @@
-"""Stepping many worlds: the same bits as `simulate`, saved state, force drive, balance of loads, bad input."""
+"""Stepping many worlds: of several kinds, saved state, force drive, balance of loads, bad input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.groups import Readout
-from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.trajectory import SimulatorState
 from endopilot.types import Anatomy
@@ -45,21 +44,6 @@ def begun(simulator: Simulator, worlds: int) -> Simulator:
     first = start(worlds)
     simulator.reset(inserted_length=first[:, 0], rotation=first[:, 1])
     return simulator
-
-
-def test_steps_of_another_length_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
-    control, period_s = controls(12, 3), 0.06  # no multiple of the time step
-    whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3), period_s=period_s)
-    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
-    for t in range(12):
-        step = simulator.step(control[t], period_s)
-        for name in ("tip_position", "contact_force_max", "wall_force", "slip"):
-            np.testing.assert_array_equal(getattr(step, name), getattr(whole, name)[:, t], err_msg=name)
-    np.testing.assert_array_equal(simulator.inserted_length, step.inserted_length)
-    np.testing.assert_array_equal(whole.inserted_length[:, -1], step.inserted_length)
-    assert whole.period_s == period_s
-    with pytest.raises(InputError, match="period_s: 0"):
-        simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), period_s=0.0)
 
 
 def test_every_world_has_its_own_anatomy_and_device(anatomy: Anatomy, wider: Anatomy) -> None:

@@ -27,11 +27,6 @@ SAMPLES = 6
 BY_DEVICE = "worlds samples devices"
 
 
-@pytest.fixture(scope="module")
-def vessel() -> Anatomy:
-    return make_patient(AtlasConfig(count=1), 0)
-
-
 def drives(worlds: int, devices: int) -> tuple[np.ndarray, np.ndarray]:
     """Return starts and controls of random drives."""
     draw = np.random.default_rng(3)
@@ -190,7 +185,6 @@ def _refused(path: Path, anatomy, message: str) -> None:
     with pytest.raises(InputError) as error:
         read_trajectory(path, anatomy=anatomy)
     assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("devices", [1, 2])

@@ -27,19 +27,19 @@ RIGID, SOFT = SimulatorConfig(), SimulatorConfig(compliant_wall_n_mm2=0.01)
 
 
 @pytest.fixture(scope="module")
-def pushed(bend):
+def pushed(anatomy):
     """Return a function that pushes a wire into the bend under some settings and a coefficient of friction."""
 
     def push(friction=0.1, **changed):
         return simulate(
-            bend, WIRE, PUSH, initial=START, friction=np.array([[friction]]), config=replace(CORE, **changed)
+            anatomy, WIRE, PUSH, initial=START, friction=np.array([[friction]]), config=replace(CORE, **changed)
         )
 
     return push
 
 
-def test_a_state_has_its_numbers_where_they_are_said_to_be(bend):
-    simulator = Simulator(bend, WIRE, worlds=2, config=CORE)
+def test_a_state_has_its_numbers_where_they_are_said_to_be(anatomy):
+    simulator = Simulator(anatomy, WIRE, worlds=2, config=CORE)
     simulator.reset(inserted_length=[35.0, 40.0], rotation=[0.0, 0.5], friction=[0.1, 0.3])
     simulator.step(np.tile([5.0, 0.0], (2, 1)), 0.5)
     numbers = nodes_of(simulator.state.values[0], simulator.nodes, 1)
@@ -73,15 +73,15 @@ def test_what_is_rough_ahead_holds_the_wire_once_it_is_there(pushed):
     np.testing.assert_allclose(force[:3], before[:3], rtol=0.05)
 
 
-def test_the_wall_yields_where_it_is_soft(bend):
+def test_the_wall_yields_where_it_is_soft(anatomy):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
 
     def dents(**changed):
-        made = simulate(bend, WIRE, PUSH, initial=START, config=replace(soft, **changed), record_shape=True)
+        made = simulate(anatomy, WIRE, PUSH, initial=START, config=replace(soft, **changed), record_shape=True)
         assert made.valid.all() and made.shape is not None
         nodes = made.shape[0, -1]
-        depth = WIRE.tip_radius_mm - sample(bend.distance_map, nodes)
-        along = bend.tree.branches[0].centerline
+        depth = WIRE.tip_radius_mm - sample(anatomy.distance_map, nodes)
+        along = anatomy.tree.branches[0].centerline
         at = along.abscissa[np.argmin(np.linalg.norm(nodes[:, None] - along.points, axis=2), axis=1)]
         return at, depth, made.base_force[0, -1, 0]
 
@@ -94,9 +94,9 @@ def test_the_wall_yields_where_it_is_soft(bend):
     assert graded[at < 25].max() > 2 * grew[at < 25].max() and graded[at > 40].max() < grew[at > 40].max()
 
 
-def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
+def test_the_wall_yields_to_the_side_where_it_is_soft(anatomy):
     """Factors begin at the normals, which here stand across the plane of the bend: its outer wall is a quarter away."""
-    line = bend.tree.branches[0].centerline
+    line = anatomy.tree.branches[0].centerline
     tangent = np.gradient(line.points, axis=0)
     outwards = np.cross(tangent, line.normals)  # a quarter turn on from the normals
     middle = len(line.points) // 2
@@ -104,9 +104,9 @@ def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
 
     def dent(around):
         config = replace(CORE, compliant_wall_n_mm2=0.04, wall_around=around)
-        made = simulate(bend, WIRE, PUSH, initial=START, config=config, record_shape=True)
+        made = simulate(anatomy, WIRE, PUSH, initial=START, config=config, record_shape=True)
         assert made.valid.all() and made.shape is not None
-        return (WIRE.tip_radius_mm - sample(bend.distance_map, made.shape[0, -1])).max()
+        return (WIRE.tip_radius_mm - sample(anatomy.distance_map, made.shape[0, -1])).max()
 
     one, other = dent((1.0, 0.25, 1.0, 4.0)), dent((1.0, 4.0, 1.0, 0.25))
     soft, stiff = (one, other) if outer else (other, one)
@@ -114,20 +114,22 @@ def test_the_wall_yields_to_the_side_where_it_is_soft(bend):
     assert dent((4.0,)) == pytest.approx(dent((4.0, 4.0, 4.0)), rel=1e-6)
 
 
-def test_walls_that_vary_otherwise_are_not_shared(bend):
+def test_walls_that_vary_otherwise_are_not_shared(anatomy):
     soft = replace(CORE, compliant_wall_n_mm2=0.04)
     # as stiff where they are stiffest: the maps alone differ
-    one, other = (Simulator(bend, WIRE, config=replace(soft, wall_along=each)) for each in ((0.25, 4.0), (4.0, 0.25)))
+    one, other = (
+        Simulator(anatomy, WIRE, config=replace(soft, wall_along=each)) for each in ((0.25, 4.0), (4.0, 0.25))
+    )
     for each in (one, other):
         each.reset(inserted_length=[40.0], rotation=[0.0])
     assert np.abs(other.position - one.position).max() > 1e-3
 
 
-def test_a_factor_is_linear_between_its_places(bend):
-    end = float(bend.tree.longest_path().abscissa[-1])
-    found = factor_at(np.array([-3.0, 0.0, 0.25 * end, end, end + 9.0]), bend.tree, (1.0, 3.0, 2.0))
+def test_a_factor_is_linear_between_its_places(anatomy):
+    end = float(anatomy.tree.longest_path().abscissa[-1])
+    found = factor_at(np.array([-3.0, 0.0, 0.25 * end, end, end + 9.0]), anatomy.tree, (1.0, 3.0, 2.0))
     assert found == pytest.approx([1.0, 1.0, 2.0, 2.0, 2.0])
-    assert factor_at(np.array([5.0]), bend.tree, (3.0,)) == pytest.approx([3.0])
+    assert factor_at(np.array([5.0]), anatomy.tree, (3.0,)) == pytest.approx([3.0])
     with pytest.raises(InputError, match="wall_along: the wall is not compliant"):
         SimulatorConfig(wall_along=(1.0, 2.0))
     with pytest.raises(InputError, match="wall_around: the wall is not compliant"):
@@ -136,8 +138,8 @@ def test_a_factor_is_linear_between_its_places(bend):
         SimulatorConfig(compliant_wall_n_mm2=0.01, wall_along=(1.0, 0.25))
 
 
-def test_a_stiff_wire_straightens_a_compliant_vessel(bend) -> None:
-    rigid, soft = (simulate(bend, STIFF, FARTHER, config=config) for config in (RIGID, SOFT))
+def test_a_stiff_wire_straightens_a_compliant_vessel(anatomy) -> None:
+    rigid, soft = (simulate(anatomy, STIFF, FARTHER, config=config) for config in (RIGID, SOFT))
     assert rigid.valid.all() and soft.valid.all()
     assert soft.wall_force.max() < 0.7 * rigid.wall_force.max()
     assert soft.base_force.max() < rigid.base_force.max()
@@ -145,9 +147,11 @@ def test_a_stiff_wire_straightens_a_compliant_vessel(bend) -> None:
     assert (soft.tip.abscissa[:, -1] != rigid.tip.abscissa[:, -1]).all()
 
 
-def test_the_displacement_does_not_depend_on_the_elements(bend) -> None:
+def test_the_displacement_does_not_depend_on_the_elements(anatomy) -> None:
     # The wall's stiffness belongs to the length of the wire, not to its nodes.
-    rough, fine = (simulate(bend, STIFF, FARTHER[:1], config=replace(SOFT, element_mm=size)) for size in (0.75, 0.375))
+    rough, fine = (
+        simulate(anatomy, STIFF, FARTHER[:1], config=replace(SOFT, element_mm=size)) for size in (0.75, 0.375)
+    )
     np.testing.assert_allclose(fine.tip_position[0, -1], rough.tip_position[0, -1], atol=0.01)
     np.testing.assert_allclose(fine.contact_force_sum[0, 8:], rough.contact_force_sum[0, 8:], rtol=0.05)
 

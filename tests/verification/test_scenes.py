@@ -39,10 +39,9 @@ def test_a_tip_sticks_at_ridges_and_slips_over_them() -> None:
     assert (run.force_n[leaps + 1] < 0.8 * run.force_n[leaps]).all()
 
 
-def test_a_short_curved_wire_lags_and_a_long_one_whips() -> None:
-    # L √(EI κ₀ κ_t / GJ) is 1.14 and 2.56: below and above π/2
-    smooth, whipping = scenarios.turn_in_a_bend(20.0, turns=1.0), scenarios.turn_in_a_bend(45.0, turns=1.0)
-    assert np.diff(smooth.tip_rad).max() < 0.5
+def test_a_long_curved_wire_whips() -> None:
+    # L √(EI κ₀ κ_t / GJ) is 2.56, above π/2; `torque_whip` of the verification has a short one too
+    whipping = scenarios.turn_in_a_bend(45.0, turns=0.75)
     jump = int(np.argmax(np.diff(whipping.tip_rad)))
     assert np.diff(whipping.tip_rad)[jump] > np.pi
     assert (whipping.drive_rad - whipping.tip_rad)[jump] > np.pi / 2
@@ -51,10 +50,6 @@ def test_a_short_curved_wire_lags_and_a_long_one_whips() -> None:
     drive, torque = scenarios.whip_theory(45.0, tip)
     assert whipping.drive_rad[jump] == pytest.approx(drive.max(), rel=0.04)
     assert whipping.torque_n_mm.max() == pytest.approx(torque.max(), rel=0.04)
-    # the short wire follows its whole curve
-    drive, _ = scenarios.whip_theory(20.0, np.linspace(0, 2 * np.pi, 100))
-    expected = np.interp(smooth.drive_rad, drive, np.linspace(0, 2 * np.pi, 100))
-    np.testing.assert_allclose(smooth.tip_rad, expected, atol=0.12)
 
 
 def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:

@@ -13,7 +13,6 @@ from PIL import Image
 from pydicom.uid import ExplicitVRLittleEndian
 
 from endopilot import make_angiograms
-from endopilot.anatomy.io import write_anatomy
 from endopilot.angiograms.config import AngiogramsConfig
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import command_of
@@ -32,12 +31,11 @@ CONFIG = AngiogramsConfig(
 
 
 @pytest.fixture(scope="module")
-def made(fork, tmp_path_factory) -> Path:
+def made(vessel, tmp_path_factory) -> Path:
     """Return a cine of `endopilot angiograms`, of a patient who lies in a drawn pose."""
-    folder = tmp_path_factory.mktemp("cine")
-    write_anatomy(fork, output=folder / "fork")
-    make_angiograms([folder / "fork"], output=folder / "made", device="workhorse-014", config=CONFIG)
-    return folder / "made" / "cines" / "fork-0000"
+    output = tmp_path_factory.mktemp("cine") / "made"
+    make_angiograms([vessel], output=output, device="workhorse-014", config=CONFIG)
+    return output / "cines" / "fork-0000"
 
 
 def changed(made: Path, path: Path, **values) -> Path:
