@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.extras import extras_present, requirements_of_extras
+from endopilot.extras import extras_present
 
 README = Path(__file__).parents[2] / "README.md"
 NEEDS = {
@@ -100,7 +100,3 @@ def test_the_readme_installs_what_its_commands_need() -> None:
         assert not command or NEEDS.get(command[1], set()) <= brought, line
     forms = set(re.findall(r"pip install (?:-\S+ )*'?([^\s'\[`]+)\[", text))
     assert forms == {"endopilot"}  # one form in all lines
-
-
-def test_some_libraries_are_hidden() -> None:
-    assert {"torch", "plotly", "starlette"} <= set().union(*requirements_of_extras().values())

@@ -50,27 +50,6 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
     assert json.loads(result.stdout)["endopilot"]
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("segment", "missing.nii.gz", "-o", "mask.nii.gz"),
-        ("anatomy", "missing.stl", "-o", "out"),
-        ("phantom", "missing", "-o", "ct.nii.gz"),
-        ("simulate", "missing", "-o", "out.parquet"),
-        ("dataset", "missing", "-o", "out"),
-        ("train", "missing", "-o", "out"),
-        ("evaluate", "missing", "-o", "out"),
-        ("replay", "missing.csv", "--anatomy", "missing", "-o", "out"),
-    ],
-)
-def test_a_missing_input_is_reported_in_one_line(
-    arguments: tuple[str, ...], tmp_path: Path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert "missing" in refused(capsys, *arguments)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_suffix_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The folder holds no anatomy, which is found out when the work begins."""
     folder, lines = str(tmp_path), tmp_path / "lines.csv"

@@ -51,11 +51,11 @@ def test_ten_tools_have_typed_answers(folder) -> None:
 
 def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
     line = StdioServerParameters(command=sys.executable, args=["-m", "endopilot.cli", "mcp", str(folder)])
-    plan = {"anatomy": "patient", "target": "0,0,35", "output": "plan"}
+    plan = {"anatomy": "patient", "target": "0,0,15", "output": "plan"}
     rollout = {"anatomy": "patient", "controls": "plan", "output": "rollout.csv"}
     _, (planned, driven) = asked(folder, ("plan", plan), ("simulate", rollout), over=stdio_client(line))
     assert planned.structured_content["reached"] and planned.structured_content["plan"] == "plan"
-    assert driven.structured_content["deepest_tip_mm"] == pytest.approx(35.0, abs=3.0)
+    assert driven.structured_content["deepest_tip_mm"] == pytest.approx(15.0, abs=3.0)
     assert (folder / "rollout.csv").exists()
 
 

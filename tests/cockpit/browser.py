@@ -1,4 +1,4 @@
-"""A server in a process of its own, a browser, and films that are driven, for tests."""
+"""A stage that notes what it is asked, a server in a process of its own, a browser, and films that are driven."""
 
 from __future__ import annotations
 
@@ -9,6 +9,30 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+
+from endopilot.cockpit.frames import encode
+
+
+class Stage:
+    """Notes what it is asked, and breaks at its 5000th cycle."""
+
+    def __init__(self):
+        self.heard, self.halted, self.cycles = [], [], 0
+
+    def handle(self, message, now_s):
+        self.heard.append(message)
+
+    def halt(self, why):
+        self.halted.append(why)
+
+    def cycle(self, now_s):
+        self.cycles += 1
+        if self.cycles == 5000:
+            raise RuntimeError("broken")
+        return [("state", encode("state", {"cycle": self.cycles}))]
+
+    def close(self):
+        self.halted.append("closed")
 
 
 class Server:

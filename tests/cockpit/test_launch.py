@@ -6,25 +6,12 @@ import asyncio
 import socket
 
 import pytest
+from browser import Stage
 
 uvicorn = pytest.importorskip("uvicorn", reason="the extra `cockpit` is not installed")
 
 from endopilot.cockpit.server import serve  # noqa: E402
 from endopilot.errors import InputError  # noqa: E402
-
-
-class Nothing:
-    def handle(self, message, now_s):
-        pass
-
-    def halt(self, why):
-        pass
-
-    def cycle(self, now_s):
-        return []
-
-    def close(self):
-        pass
 
 
 def test_messages_to_pages_do_not_wait_for_each_other(monkeypatch):
@@ -42,7 +29,7 @@ def test_messages_to_pages_do_not_wait_for_each_other(monkeypatch):
             writer.close()
 
     monkeypatch.setattr(uvicorn.Server, "run", lambda self, sockets: asyncio.run(connect(sockets[0])))
-    serve(Nothing(), lambda: b"", cycle_s=0.0125, listening=lambda url: None)
+    serve(Stage(), lambda: b"", cycle_s=0.0125, listening=lambda url: None)
     assert found == [1]
 
 
@@ -54,14 +41,14 @@ def test_the_address_that_is_printed_can_be_asked_for(monkeypatch, host, page):
         pytest.skip("no IPv6 here")
     printed = []
     monkeypatch.setattr(uvicorn.Server, "run", lambda self, sockets: None)
-    serve(Nothing(), lambda: b"", cycle_s=0.0125, host=host, listening=printed.append)
+    serve(Stage(), lambda: b"", cycle_s=0.0125, host=host, listening=printed.append)
     assert printed[0].startswith(page)
 
 
 @pytest.mark.parametrize("host", ["256.1.1.1", "a..b", "192.0.2.77", "nonesuch.invalid", "http://x", "[::1]"])
 def test_what_is_no_address_of_this_machine_is_refused(host):
     with pytest.raises(InputError, match=r"host, port: cannot listen on .*; choose others"):
-        serve(Nothing(), lambda: b"", cycle_s=0.0125, host=host)
+        serve(Stage(), lambda: b"", cycle_s=0.0125, host=host)
 
 
 def test_a_port_in_use_is_refused():
@@ -69,4 +56,4 @@ def test_a_port_in_use_is_refused():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(InputError, match=r"host, port: cannot listen on .*in use.*; choose others"):
-            serve(Nothing(), lambda: b"", cycle_s=0.0125, port=taken.getsockname()[1])
+            serve(Stage(), lambda: b"", cycle_s=0.0125, port=taken.getsockname()[1])

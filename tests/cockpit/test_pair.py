@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from browser import shown
 from test_game import Rival, play
-from test_session import run
+from test_session import drive, run
 
 from endopilot.cockpit import game
 from endopilot.cockpit.film import open_film
@@ -149,16 +148,6 @@ def test_a_session_without_a_sample_is_refused(session, tmp_path):
     assert not (tmp_path / "episode").exists()
 
 
-def drive_alone(session, until, most_s=20.0):
-    began = time.monotonic()
-    while not until() and time.monotonic() - began < most_s:
-        now = time.monotonic() - began
-        session.handle(both(), now)
-        session.cycle(now)
-        time.sleep(0.0005)
-    assert until(), session.autopilot.values()
-
-
 def start(session, policy):
     session._policies = (policy,)
     session.handle(Autopilot(type="autopilot", action="start", policy=policy), 0.0)
@@ -166,7 +155,7 @@ def start(session, policy):
 
 def test_a_policy_drives_both(session):
     start(session, "in-turn")
-    drive_alone(session, lambda: session.autopilot.status == "reached")
+    drive(session, until=lambda: session.autopilot.status == "reached")
     assert abs(session.world.snapshot().tip.abscissa[0] - session.target.abscissa) <= 2.0
     run(session, 0.5, message=both(catheter=(6.0, 0.0)), start=1e3)
     start(session, "catheter-alone")  # begins with the catheter where it is
@@ -179,7 +168,7 @@ def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xra
     session = Session(world, xray, recorded(world))
     run(session, 0.5, message=both(catheter=(0.0, 3.0)))
     start(session, "in-turn")
-    drive_alone(session, lambda: session.autopilot.status == "failed")
+    drive(session, until=lambda: session.autopilot.status == "failed")
     assert session.autopilot.failure == f"in-turn: begins with unturned catheters; turn {NAME} back to 0° first"
     session.close()
 
@@ -205,13 +194,7 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
     control = np.array([[[[8.0, 1.0], [6.0, 0.0]], [[4.0, -2.0], [0.0, 2.0]], [[-6.0, 1.0], [8.0, 0.0]]]])
     initial = np.array([[[2.0, 0.1], [1.0, 0.0]]])
     config = SimulatorConfig(threads=1)
-    rollout = simulate(
-        fork,
-        navigation.stack,
-        control.reshape(*control.shape[:2], 2, 2),
-        initial=initial.reshape(1, 2, 2),
-        config=config,
-    )
+    rollout = simulate(fork, navigation.stack, control, initial=initial, config=config)
     rollout.write(tmp_path / "r.npz")
     film = shown(open_film(tmp_path / "r.npz", vessel))
     last = film.frames[-1].snapshot

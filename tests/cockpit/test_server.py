@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("starlette", reason="the extra `cockpit` is not installed")
 pytest.importorskip("httpx2", reason="httpx2, which Starlette's test client needs, is not installed")
 
+from browser import Stage
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
@@ -22,28 +23,6 @@ pytestmark = pytest.mark.timeout(120)  # where the server falls silent, a page's
 
 HOST, TOKEN = "127.0.0.1:7000", "secret"
 ORIGIN = {"origin": f"http://{HOST}", "host": HOST}
-
-
-class Stage:
-    """Notes what it is asked."""
-
-    def __init__(self):
-        self.heard, self.halted, self.cycles = [], [], 0
-
-    def handle(self, message, now_s):
-        self.heard.append(message)
-
-    def halt(self, why):
-        self.halted.append(why)
-
-    def cycle(self, now_s):
-        self.cycles += 1
-        if self.cycles == 5000:
-            raise RuntimeError("broken")
-        return [("state", encode("state", {"cycle": self.cycles}))]
-
-    def close(self):
-        self.halted.append("closed")
 
 
 @pytest.fixture

@@ -165,8 +165,6 @@ class Scripted:
         return BelievedTip(3.0, 0.1, (1.0, 0.2), asks="it is dark" if len(self.seen) % 3 == 2 else "")
 
     def believed_wires(self):
-        import numpy as np
-
         return np.zeros((2, 5, 3))
 
 
@@ -194,17 +192,15 @@ def driven(world, xray, recorded):
     made.close()
 
 
-def drive(driven, *, until, most_s=20.0, alive=True):
+def drive(driven, *, until, most_s=20.0):
     """Let cycles pass until something holds; return all messages but images."""
     sent, began = [], time.monotonic()
-    now = 0.0
     while not until() and time.monotonic() - began < most_s:
         now = time.monotonic() - began
-        if alive:
-            driven.handle(Drive(type="drive", translation=0.0, rotation=0.0), now)
+        driven.handle(Drive(type="drive", translation=0.0, rotation=0.0), now)
         sent += [decode(message)[0] for channel, message in driven.cycle(now) if not channel.startswith("image")]
         time.sleep(0.0005)
-    assert until()
+    assert until(), driven.autopilot.values()
     return sent
 
 

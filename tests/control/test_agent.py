@@ -26,6 +26,14 @@ from endopilot.types import TipProjection
 from toy_belief import QUICK, measured
 
 
+@pytest.fixture
+def policy(side_branch) -> AgentPolicy:
+    """Return an agent that has begun a navigation into the side branch."""
+    begun = AgentPolicy(QUICK)
+    begun.start(side_branch, 0)
+    return begun
+
+
 def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
     failed = NavigationLoop(replace(side_branch, seconds=8.0), "forward", seed=1).run()
     assert not failed.success
@@ -86,17 +94,13 @@ def test_without_play_what_is_known_of_the_robot_changes_nothing(side_branch) ->
     assert np.array_equal(told.tip_position, untold.tip_position) and np.array_equal(told.control, untold.control)
 
 
-def test_the_first_decision_goes_by_the_first_reading(side_branch) -> None:
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
+def test_the_first_decision_goes_by_the_first_reading(policy) -> None:
     (velocity,) = policy.decide(Observation(0.0, ((2.3, 0.1),), None)).devices
     assert policy._follower.course is not None
     assert velocity == tuple(((policy._follower.course.proximal[0, 0] - [2.3, 0.1]) / 0.5).tolist())
 
 
-def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> None:
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
+def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(policy) -> None:
     shown = measured(policy.belief, 0)
     first = policy.decide(Observation(0.0, ((2.0, 0.0),), shown))
     assert first.devices[0][0] > 0
@@ -107,9 +111,8 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     assert policy.plans == 2  # found again, it searches another path
 
 
-def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(side_branch) -> None:
-    policy, said = AgentPolicy(QUICK), ""
-    policy.start(side_branch, 0)
+def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(policy) -> None:
+    said = ""
     policy.monitor.changes_left = 0  # nothing else is sought
     for k in range(4):
         shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
@@ -121,17 +124,13 @@ def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(side_branch) ->
     assert "lost 4 times: no wire, lumen or ostium explains what X-ray shows" in said
 
 
-def test_a_wire_that_is_out_and_still_seen_ends_the_navigation(side_branch) -> None:
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
+def test_a_wire_that_is_out_and_still_seen_ends_the_navigation(policy) -> None:
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
     said = [policy.decide(Observation(0.5 * k, ((mm, 0.0),), far)).gives_up for k, mm in enumerate((4.0, 2.0, 0.0))]
     assert said[:2] == ["", ""] and said[2].startswith("pulled out, the wire is still seen: no wire")
 
 
-def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_branch) -> None:
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
+def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(policy) -> None:
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
     assert policy.decide(Observation(0.0, ((6.0, 0.0),), far)).devices[0][0] < 0
     assert policy.decide(Observation(0.5, ((4.0, 0.0),), None)).devices[0][0] < 0  # not there yet
@@ -199,9 +198,7 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     likeliest = int(np.argmax(loop.policy.belief.weight))
     np.testing.assert_array_equal(wires[0], loop.policy.belief.simulator.position[likeliest])
     assert loop.believed.abscissa == tip.abscissa[likeliest]
-    while loop.reason is None:
-        loop.step()
-    record = loop.record()
+    record = loop.run()
     assert record.success and record.safe
     assert record.exposed[10], "the policy goes on with an image"
     ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1, 0])
@@ -217,10 +214,8 @@ def nowhere_to_go() -> Course:
     return Course(control=none, proximal=none, tip=tips, force=tip, checked=no, exposed=no, reached=1.0)
 
 
-def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
+def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch, policy) -> None:
     """No simulated wire says why the target is not reached: X-ray shows how far it is off."""
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
     shown, here = measured(policy.belief, 0), float(policy.belief.tip.abscissa[0])
     for off_mm, translation in ((0.4, 0.8), (-0.4, -0.8), (1.9, 2.0)):  # at most 2 mm/s
         navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
@@ -233,10 +228,8 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
         assert seen.expose and seen.devices[0] == pytest.approx((translation, 0.0))
 
 
-def test_a_wire_beside_its_target_gets_another_course(side_branch) -> None:
+def test_a_wire_beside_its_target_gets_another_course(side_branch, policy) -> None:
     """A second rule of a task asks for more than the right place along the vessel."""
-    policy = AgentPolicy(QUICK)
-    policy.start(side_branch, 0)
     shown, here = measured(policy.belief, 0), float(policy.belief.tip.abscissa[0])
     for near_mm, goes_on in ((None, False), (0.01, True)):
         policy.start(replace(side_branch, target=Target(branch=0, abscissa=here, near_mm=near_mm)), 0)

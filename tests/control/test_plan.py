@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +89,6 @@ def test_a_plan_for_another_vessel_or_devices_and_a_damaged_one_are_refused(pair
         read_plan(folder, anatomy)
 
 
-@dataclass
 class Toy:
     """A predictor of a tip that lags behind: Δtip = 0.9 Δ, γtip = 0.5 mm. Its inverse knows that."""
 

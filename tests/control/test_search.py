@@ -125,9 +125,7 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     loop.hand_over(None)
     followed = policy.belief.simulator.inserted_length[:, 1] - policy.belief.ostium_mm
     assert loop.observation is not None and followed == pytest.approx(loop.observation.devices[1][0])
-    while loop.reason is None:
-        loop.step()
-    record = loop.record()
+    record = loop.run()
     assert record.reason == "reached" and record.safe and record.exposed[5]
 
 

@@ -1,4 +1,4 @@
-"""The dataset on disk: layout, content, resumption, and what is refused."""
+"""The dataset on disk: layout, content, resumption, what is refused, and the same work on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -102,40 +102,29 @@ def test_killed_and_resumed_gives_the_same_bits(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "left"),
+    ("name", "kept"),
     [
-        ("data/chunk-000/file-001.parquet", "nothing"),
-        ("data/chunk-000/file-001.parquet", "50 bytes less"),
-        ("meta/episodes/chunk-000/file-000.parquet", "empty"),
+        ("data/chunk-000/file-001.parquet", None),
+        ("data/chunk-000/file-001.parquet", -50),
+        ("meta/episodes/chunk-000/file-000.parquet", 0),
+        ("meta/info.json", None),
+        ("meta/stats.json", -50),
+        ("meta/tasks.parquet", -50),
     ],
 )
-def test_a_lost_or_cut_file_is_made_again(tmp_path, name, left):
+def test_a_lost_or_cut_file_is_made_again(tmp_path, name, kept):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
     before, file = data_hashes(tmp_path / "d"), tmp_path / "d" / name
     content = file.read_bytes()
-    if left == "nothing":
+    if kept is None:
         file.unlink()
     else:
-        kept = {"empty": 0, "50 bytes less": -50}[left]
         file.write_bytes(content[:kept])
-    with pytest.raises(InputError, match=rf"{file.name}: (missing|damaged)"):
-        read_dataset(tmp_path / "d")
+    if file.name not in ("stats.json", "tasks.parquet"):  # which are for others alone
+        with pytest.raises(InputError, match=rf"{file.name}: (missing|damaged)"):
+            read_dataset(tmp_path / "d")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
     assert data_hashes(tmp_path / "d") == before and file.read_bytes() == content
-
-
-@pytest.mark.parametrize(("name", "cut"), [("info.json", None), ("stats.json", 50), ("tasks.parquet", 50)])
-def test_a_lost_or_cut_description_is_made_again(tmp_path, name, cut):
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    before = (tmp_path / "d/meta" / name).read_bytes()
-    (tmp_path / "d/meta" / name).unlink()
-    if cut:
-        (tmp_path / "d/meta" / name).write_bytes(before[:-cut])
-    elif name == "info.json":
-        with pytest.raises(InputError, match=r"info\.json: missing"):
-            read_dataset(tmp_path / "d")
-    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    assert (tmp_path / "d/meta" / name).read_bytes() == before
 
 
 def test_another_anatomy_in_the_place_of_the_dataset_s_own_is_refused(tmp_path):
@@ -234,3 +223,27 @@ def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(layout, "__version__", "99.0")
     with pytest.raises(InputError, match=rf"was begun with version = endopilot {__version__}, .*endopilot 99\.0"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+
+
+def test_a_cluster_gives_the_same_bits(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="pip install 'endopilot[cluster]'")
+    settings = {"patients": 3, "sequences": 20, "sequences_per_file": 5}
+    make_toy_dataset(tmp_path / "here", **settings)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, local_directory=tmp_path / "space"
+    ) as cluster:
+        make_toy_dataset(tmp_path / "there", scheduler=cluster.scheduler_address, **settings)
+    assert data_hashes(tmp_path / "there") == data_hashes(tmp_path / "here")
+
+
+def test_a_scheduler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="pip install 'endopilot[cluster]'")
+    monkeypatch.setattr("endopilot.dataset.generate._CONNECT_TIMEOUT_S", 1)
+    with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4, scheduler="tcp://127.0.0.1:9")
+
+
+def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"endopilot\[cluster\]"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4, scheduler="tcp://127.0.0.1:9")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import logging
 import re
-import shutil
 import warnings
 import zlib
 from pathlib import Path
@@ -23,35 +22,26 @@ from endopilot.imaging.volume import read_mask, write_volume
 from endopilot.types import Volume
 
 
-def _changed(source: Path, target: Path, every: int = 1, **values) -> Path:
-    shutil.copytree(source, target)
-    for file in sorted(target.iterdir())[::every]:
-        slice_ = pydicom.dcmread(file)
-        for name, value in values.items():
-            setattr(slice_, name, value)
-        slice_.save_as(file)
-    return target
-
-
-def test_a_straightened_ct_is_told_by_every_command(right_artery, tmp_path, capsys, monkeypatch):
+def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, monkeypatch):
     """The mask lies on straightened axes: its anatomy tells it too, from the file beside the mask."""
     from endopilot.pipeline import study
 
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
     _, j, i = np.indices((40, 40, 40))
     hu = np.where(np.hypot(j - 20, i - 20) < 7, 350, -90).astype(np.int16)
-    write_volume(Volume(hu, np.full(3, 2.0), np.array([-25.0, -45.0, -72.0]), np.eye(3)), tmp_path / "straight")
-    turned = ["1", "0", "0", "0.002", "0.999998", "0"]
-    skewed = _changed(tmp_path / "straight", tmp_path / "ct", ImageOrientationPatient=turned)
+    skewed = tmp_path / "ct"
+    write_volume(Volume(hu, np.full(3, 2.0), np.array([-25.0, -45.0, -72.0]), np.eye(3)), skewed)
+    for file in skewed.iterdir():
+        slice_ = pydicom.dcmread(file)
+        slice_.ImageOrientationPatient = ["1", "0", "0", "0.002", "0.999998", "0"]
+        slice_.save_as(file)
     seed = ("15", "-5", "0")
     method = ("--method", "my_segmentation:threshold", "--options", "above=200", "--seeds", *seed)
     note = "ct: the axes in ImageOrientationPatient and ImagePositionPatient are off unit vectors"
     figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)
     assert figures["warnings"][0].startswith(note)
     assert read_mask(tmp_path / "mask.nii.gz").warnings[0].startswith(note)
-    image = run(
-        capsys, "xray", right_artery, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-length-mm", "10"
-    )
+    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-length-mm", "10")
     assert image["ct_notes"][0].startswith(note)
     monkeypatch.setattr(study, "_study", lambda run, anatomies: {"notes": list(run.notes)})
     figures = run(capsys, "run", skewed, "-o", tmp_path / "run", *method)

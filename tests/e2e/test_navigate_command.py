@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -98,26 +97,6 @@ def test_the_page_needs_nothing_beside_it(driven):
     assert len(outside) < len(page) / 2 and not re.search(r"""(src|href)=["']?http""", outside)
 
 
-def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path):
-    folder, _ = driven
-    again = run(
-        capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--shape", "-o", tmp_path / "again.npz"
-    )
-    assert again["valid_worlds"] == 1
-    recorded, wire = read_trajectory(folder / "trajectory.npz"), read_trajectory(tmp_path / "again.npz")
-    assert recorded.shape is None and wire.shape is not None
-    for name in ("tip_position", "inserted_length", "base_force", "command", "contact_force_max"):
-        np.testing.assert_array_equal(getattr(wire, name), getattr(recorded, name))
-    table = pd.read_csv(folder / "navigation.csv")
-    places = table[[f"tip_{axis}_mm" for axis in "xyz"]].to_numpy()
-    np.testing.assert_array_equal(recorded.tip_position[0, 9::10, 0], places[1:])
-    line = refused(
-        *(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--device", "wire-018"),
-        *("-o", tmp_path / "no.npz"),
-    )
-    assert "device: " in line and "was made with another (workhorse-014), not with this wire-018" in line
-
-
 def test_the_trajectory_holds_what_was_decided(driven):
     folder, figures = driven
     recorded, table = read_trajectory(folder / "trajectory.npz"), pd.read_csv(folder / "navigation.csv")
@@ -185,8 +164,10 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     for part in ("--catheter microcatheter-1.7f", "Guidewire workhorse-014", "Catheter microcatheter-1.7f"):
         assert part in page
     assert "The catheter is turquoise, and covers what lies in it." in page
-    line = refused(capsys, *command, "-o", tmp_path / "n")
-    assert "arrives: catheter; there is none" in line
+    assert "arrives: catheter; there is none" in refused(capsys, *command, "-o", tmp_path / "n")
+    other = ("--controls", folder / "trajectory.npz", "--device", "wire-018", "-o", tmp_path / "no.npz")
+    line = refused(capsys, "simulate", patient, *other)
+    assert "was made with another (workhorse-014 in microcatheter-1.7f), not with this wire-018" in line
 
 
 def test_the_picture_shows_wire_and_catheter(patient):
@@ -256,20 +237,12 @@ def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, pati
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_without_the_extras_a_navigation_writes_what_it_can_and_says_what_is_left_out(patient, tmp_path):
-    config = NavigateConfig(tip="own", seconds=5.0)
-    with patch.object(navigation, "extras_present", lambda: {"learn": False, "report": False}):
-        figures = navigation.navigate_into(
-            patient, target="1", output=tmp_path / "bare", policy="forward", config=config
-        )
-    written = ["manifest.json", "navigation.csv", "run.json", "trajectory.npz"]
-    assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == written and figures["page"] is None
-    assert figures["left_out"] == "files that need: pip install 'endopilot[learn,report]'"
-
-
-def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, capsys, tmp_path):
-    output = tmp_path / "killed"
-    command = ("navigate", patient, "--target", "1", "-o", output, "--policy", "forward", *SHORT)
+def test_an_interrupted_navigation_to_a_point_is_finished_by_the_same_command(patient, capsys, tmp_path):
+    """The point lies beside the vessel, and is moved to it."""
+    line, output = read_anatomy(patient).tree.branches[0].centerline, tmp_path / "killed"
+    at = len(line.points) // 3
+    target = ",".join(f"{value:.4f}" for value in line.points[at] + 0.7 * line.normals[at])
+    command = ("navigate", patient, f"--target={target}", "-o", output, "--policy", "forward", *SHORT)
     run(capsys, *command)
     for last in ("manifest.json", "navigation.html"):  # as if it had been killed before
         (output / last).unlink()
@@ -277,19 +250,9 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
     assert sorted(path.name for path in output.iterdir()) == FILES
     page = (output / "navigation.html").read_text(encoding="utf-8")
     assert again["exposures"] == 1 and "Wires held possible" not in page
-
-
-def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):
-    line = read_anatomy(patient).tree.branches[0].centerline
-    at = len(line.points) // 3
-    point = line.points[at] + 0.7 * line.normals[at]
-    target = ",".join(f"{value:.4f}" for value in point)
-    figures = run(
-        capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "forward", *SHORT
-    )
-    assert figures["snapped_mm"] == pytest.approx(0.7, abs=0.02)
-    assert figures["target_mm"] == pytest.approx(line.abscissa[at], abs=0.5)
-    assert f"{figures['snapped_mm']:.1f} mm from the given point" in figures["outcome"]
+    assert again["snapped_mm"] == pytest.approx(0.7, abs=0.02)
+    assert again["target_mm"] == pytest.approx(line.abscissa[at], abs=0.5)
+    assert f"{again['snapped_mm']:.1f} mm from the given point" in again["outcome"]
 
 
 def test_what_does_not_arrive_says_why(vessel, fork, capsys, tmp_path):

@@ -39,14 +39,14 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, right_artery, capsys, tmp_path):
+def test_an_output_in_which_an_input_lies_is_refused_and_all_of_it_stays(mask, patient, capsys, tmp_path):
     (mask.parent / "thesis.txt").write_text("dear")
     before = content(mask.parent)
     inner = tmp_path / "scans" / "deeper"
     shutil.copytree(mask.parent, inner)
     for sources in ([mask], [mask, inner / mask.name]):
         assert "lies in the output" in refused(capsys, "anatomy", *sources, "-o", mask.parent)
-    assert "lies in the output" in refused(capsys, "navigate", right_artery, "--target", "2", "-o", right_artery)
+    assert "lies in the output" in refused(capsys, "navigate", patient, "--target", "2", "-o", patient)
     shutil.rmtree(inner)
     assert content(mask.parent) == before
 
@@ -65,10 +65,10 @@ def test_a_finished_anatomy_is_made_again_from_the_same_mask_alone(mask, capsys,
     assert content(folder) == before
 
 
-def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(right_artery, capsys, tmp_path):
-    table, before = tmp_path / "rollout.csv", content(right_artery)
+def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_input(patient, capsys, tmp_path):
+    table, before = tmp_path / "rollout.csv", content(patient)
     table.write_text("theirs")
-    simulate = ("simulate", right_artery, "-o", table, *SHORT)
+    simulate = ("simulate", patient, "-o", table, *SHORT)
     assert "rollout.csv: is there already" in refused(capsys, *simulate)
     assert table.read_text() == "theirs"
     run(capsys, *simulate, "--overwrite")
@@ -77,8 +77,8 @@ def test_a_file_is_replaced_only_where_the_user_says_so_and_never_one_of_the_inp
     picture.write_text("theirs")
     assert "picture.png: is there already" in refused(capsys, *simulate[:3], tmp_path / "b.csv", "--picture", picture)
     for also in ((), ("--overwrite",)):
-        assert "lumen.nrrd" in refused(capsys, "phantom", right_artery, "-o", right_artery / "lumen.nrrd", *also)
-    assert content(right_artery) == before
+        assert "lumen.nrrd" in refused(capsys, "phantom", patient, "-o", patient / "lumen.nrrd", *also)
+    assert content(patient) == before
 
 
 def test_an_output_that_is_a_link_leads_where_it_points(mask, capsys, tmp_path):
@@ -117,18 +117,12 @@ def test_a_limit_on_files_leaves_no_compiled_module_cut_short(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        "anatomy MASK -o OUT",
-        "simulate PATIENT --sequences 4 --seconds 10 --shape -o OUT.npz",
-    ],
+    "words", ["anatomy {mask} -o {out}", "simulate {patient} --sequences 4 --seconds 10 --shape -o {out}.npz"]
 )
-def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, right_artery, tmp_path):
-    names = {"MASK": str(mask), "PATIENT": str(right_artery)}
-    out, suffixes = tmp_path / "out" / "it", ("", ".nii.gz", ".nrrd", ".npz", ".png")
-    names |= {f"OUT{suffix}": f"{out}{suffix}" for suffix in suffixes}
+def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, patient, tmp_path):
+    out = tmp_path / "out" / "it"
     ended = subprocess.run(
-        [sys.executable, "-m", "endopilot.cli", *(names.get(word, word) for word in words.split())],
+        [sys.executable, "-m", "endopilot.cli", *words.format(mask=mask, patient=patient, out=out).split()],
         capture_output=True,
         text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, LIMIT)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -19,9 +18,8 @@ CTA = DATA / "cta_thorax"
 
 
 @pytest.mark.skipif(not CORONARIES.exists(), reason="the real coronary centerlines are not here")
-def test_real_coronary_centerlines_are_simulated_and_learnt_on(tmp_path, capsys):
-    for vessel in ("rca", "lca"):
-        run(capsys, "anatomy", CORONARIES / f"{vessel}_cl.vtp", "-o", tmp_path / vessel, "--vessel", vessel)
+def test_real_coronary_centerlines_are_simulated(tmp_path, capsys):
+    run(capsys, "anatomy", CORONARIES / "rca_cl.vtp", "-o", tmp_path / "rca", "--vessel", "rca")
     simulated = run(capsys, "simulate", tmp_path / "rca", "-o", tmp_path / "rollout.parquet", "--seconds", "20")
     assert simulated["valid_worlds"] == simulated["worlds"] == 8
     assert simulated["deepest_tip_mm"] > 40
@@ -29,15 +27,6 @@ def test_real_coronary_centerlines_are_simulated_and_learnt_on(tmp_path, capsys)
     assert np.isfinite(table.select_dtypes("number")).all(axis=None)
     # γ ≤ r − r_wire up to the wall's give and the difference between a circle and the union of spheres
     assert (table["tip_offset_mm"] < table["lumen_radius_mm"] + 0.5).mean() > 0.99
-
-    both = (tmp_path / "rca", tmp_path / "lca")
-    sizes = ("--sequences", "4", "--seconds", "20", "--anatomy-shares", "0.5", "0", "0.5")
-    run(capsys, "dataset", *both, "-o", tmp_path / "data", *sizes)
-    run(capsys, "train", tmp_path / "data", "-o", tmp_path / "run", "--epochs", "1", "--max-seconds", "2")
-    with patch("endopilot.report.report.png", lambda _: b""):  # drawn, and not made pixels
-        figures = run(capsys, "evaluate", tmp_path / "run", "-o", tmp_path / "evaluation")
-    assert set(figures["splits"]) >= {"test"}
-    assert np.isfinite(figures["splits"]["test"]["tip"]["P4"]["abscissa"]["all"]["mae"])
 
 
 @pytest.mark.skipif(not CTA.exists(), reason="the real CT angiogram is not here")

@@ -27,6 +27,8 @@ from endopilot.types import Volume
 
 STAGES = ["read", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
 SIZE = ("--sequences", "5", "--seconds", "20", "--training-seconds", "0.5")
+COARSE = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)
+"""CT angiograms that are segmented sooner."""
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +36,7 @@ def case(tmp_path_factory):
     """Return a folder with the CT of a patient, a wire's file, and a run on both that was killed on its way."""
     folder = tmp_path_factory.mktemp("case")
     patient = make_patient(AtlasConfig(vessel="rca", count=1, seed=1), 0)
-    write_volume(
-        make_phantom(patient, config=PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), seed=1), folder / "ct.nii.gz"
-    )
+    write_volume(make_phantom(patient, config=COARSE(), seed=4), folder / "ct.nii.gz")
     shutil.copy(device_yaml("workhorse-014")[0], folder / "wire.yaml")
     line = [sys.executable, "-m", "endopilot.cli", *map(str, arguments(folder))]
     with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
@@ -110,8 +110,7 @@ DEMO_STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dat
 
 def test_a_demo_ends_with_a_report_and_is_then_left_alone(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "demo"
-    small = partial(PhantomConfig, in_plane_mm=0.75, slice_mm=0.8, margin_mm=10.0)  # seen sooner
-    monkeypatch.setattr(study, "PhantomConfig", small)
+    monkeypatch.setattr(study, "PhantomConfig", COARSE)
     again = command.run(capsys, "demo", "-o", folder, *OF_DEMO)
 
     report = (folder / "report.html").read_text(encoding="utf-8")

@@ -120,10 +120,3 @@ def test_the_command_line_answers(clean: Path) -> None:
     assert "endopilot COMMAND" in run(clean, "endopilot", "--help").stdout
     extras = json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"]
     assert not any(extras.values())
-
-
-@needs_release
-def test_a_command_without_its_extra_says_so_in_one_line(clean: Path) -> None:
-    result = run(clean, "endopilot", "train", clean.parent, "-o", "run")
-    assert result.returncode == 2
-    assert result.stderr == "endopilot train: needs torch; install it with: pip install 'endopilot[learn]'\n"

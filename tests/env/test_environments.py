@@ -11,9 +11,8 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from env_checks import same
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
@@ -136,11 +135,11 @@ def test_worlds_that_end_are_reset_in_the_same_step_where_that_is_asked_for(near
             assert over == bool(infos.get("_final_obs", np.zeros(3))[world])
             if over:
                 ends += 1
-                assert same(infos["final_obs"][world], alone)
+                assert data_equivalence(infos["final_obs"][world], alone, exact=True)
                 final = infos["final_info"]
                 assert final["_time_s"][world] and {n: v[world] for n, v in final.items() if n[0] != "_"} == info
                 alone, info = single.reset()
-            assert same(of_world(seen, world), alone)
+            assert data_equivalence(of_world(seen, world), alone, exact=True)
             assert all(infos[name][world] == value for name, value in info.items())
     assert ends == 3
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
-from env_checks import same
-from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
 from endopilot.devices.robot import DriveConfig, RobotConfig
@@ -20,6 +20,7 @@ from endopilot.simulation.motion import motion_named
 from endopilot.tasks.task import in_catheter, reference_navigation
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipFinder
 
+same = partial(data_equivalence, exact=True)
 TIP, ABSCISSA, DISTANCE, SLACK = slice(9, 32), 9, 11, 31
 FORWARD, SEEN_FORWARD = np.array([0.5, 0.2, -1.0]), np.array([0.5, 0.2, 1.0])
 

@@ -106,15 +106,6 @@ def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(for
         assert off_deg[1] == off_deg[0]
 
 
-def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
-    for asked in ((np.nan, 1.0), (1e9, 0.0), (5.0, -np.inf)):
-        record = NavigationLoop(straight, Forward(asked[0], rotation=asked[1])).run()
-        bound = [straight.device.max_velocity_mm_s, straight.device.max_rotation_rad_s]
-        assert np.isfinite(record.control).all() and (np.abs(record.control) <= bound).all()
-        assert record.faults == len(record.time_s) - 1
-        assert record.reason != "invalid"
-
-
 @pytest.mark.parametrize("devices", [5.0, ((5.0,),), None])
 def test_what_is_no_pair_for_each_device_is_refused_in_a_line(straight, devices) -> None:
     class Odd(Forward):
@@ -165,9 +156,7 @@ def test_a_loop_that_is_over_or_within_a_period_takes_no_decision(straight) -> N
 def test_a_navigation_that_is_over_goes_on_to_another_target_without_a_limit_of_time(straight) -> None:
     hand = Hand(((6.0, 0.0),))
     loop = NavigationLoop(replace(straight, seconds=4.0, target=Target(branch=0, abscissa=12.0)), hand)
-    while loop.reason is None:
-        loop.step()
-    assert loop.reason == "reached" and loop.reached and loop.time_s < 4.0
+    assert loop.run().reason == "reached" and loop.reached and loop.time_s < 4.0
     loop.aim(straight.target)
     loop.go_on()
     hand.devices = ((2.0, 0.0),)
@@ -175,9 +164,7 @@ def test_a_navigation_that_is_over_goes_on_to_another_target_without_a_limit_of_
         loop.step()
     assert loop.reason is None and not loop.reached
     hand.devices = ((6.0, 0.0),)
-    while loop.reason is None:
-        loop.step()
-    record = loop.record()
+    record = loop.run()
     assert record.success and abs(record.tip.abscissa[-1, 0] - 30.0) <= 2.0 and record.seconds == loop.time_s
     with pytest.raises(InputError, match="abscissa"):
         loop.aim(Target(branch=0, abscissa=1e3))
@@ -289,19 +276,13 @@ def test_a_run_of_contrast_before_the_wire_shows_how_the_patient_moves(straight)
         NavigationLoop(navigation, Forward(6.0), config=replace(config, xray="assumed"), seed=2)
 
 
-def test_a_motion_is_measured_by_images_alone(fork) -> None:
-    config = NavigateConfig(tip="own", motion="both", motion_seed=3, motion_known="measured")
-    with pytest.raises(InputError, match="motion_known: measured; only X-ray images measure it"):
-        set_up_navigation(fork, "0,0,33", config=config)
-    ready = set_up_navigation(fork, "0,0,33", config=replace(config, xray="images"))
-    assert ready.navigation.known_motion == Motion()
-
-
 def test_what_is_known_of_the_motion_stands_in_the_navigation(fork) -> None:
-    own = motion_named("both", 3)
-    for known, wanted in (("nothing", None), ("published", Motion()), ("exact", own)):
-        config = NavigateConfig(tip="own", motion="both", motion_seed=3, motion_known=known)
+    moving, own = NavigateConfig(tip="own", motion="both", motion_seed=3), motion_named("both", 3)
+    for known, wanted in (("nothing", None), ("published", Motion()), ("exact", own), ("measured", Motion())):
+        config = replace(moving, motion_known=known, xray="images" if known == "measured" else "assumed")
         set_up = set_up_navigation(fork, "0,0,33", config=config)
         assert set_up.motion == own and set_up.navigation.known_motion == wanted
+    with pytest.raises(InputError, match="motion_known: measured; only X-ray images measure it"):
+        set_up_navigation(fork, "0,0,33", config=replace(moving, motion_known="measured"))
     at_rest = set_up_navigation(fork, "0,0,33", config=NavigateConfig(tip="own"))
     assert at_rest.motion is None and at_rest.navigation.known_motion is None

@@ -6,6 +6,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from endopilot.errors import InputError
@@ -32,16 +33,10 @@ TABLE = {
 TABLE = {name: np.array(values, dtype=float) for name, values in TABLE.items()}
 
 
-def csv_of(table, path):
-    rows = zip(*table.values(), strict=True)
-    lines = [",".join("" if np.isnan(value) else f"{value!r}" for value in map(float, row)) for row in rows]
-    path.write_text("\n".join([",".join(table), *lines]))
-    return read_log(path)
-
-
 def test_a_bag_is_the_log_that_its_table_is(tmp_path) -> None:
     WRITE(TABLE, tmp_path / "bag")
-    log, same = read_log(tmp_path / "bag", topics=TOPICS), csv_of(TABLE, tmp_path / "log.csv")
+    pd.DataFrame(TABLE).to_csv(tmp_path / "log.csv", index=False)
+    log, same = read_log(tmp_path / "bag", topics=TOPICS), read_log(tmp_path / "log.csv")
     assert log.by_velocity
     for name in ("command", "encoders"):
         read, known = getattr(log, name)[:, 0], getattr(same, name)[:, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -17,16 +17,8 @@ LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=
 QUIET = RobotConfig(latency_s=0.0, wire=DriveConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0))
 
 
-class State(NamedTuple):
-    """The fields of a STATE answer."""
-
-    clock: str
-    inserted: str
-    rotation: str
-    force: str
-    torque: str
-    status: str
-    ticket: str
+State = namedtuple("State", "clock inserted rotation force torque status ticket")
+"""The fields of a STATE answer."""
 
 
 class Client:

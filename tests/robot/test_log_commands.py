@@ -29,7 +29,7 @@ def log_file(fork, wire, tmp_path_factory):
 
 def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, capsys) -> None:
     options = ("--anatomy", vessel, "-o")
-    found = run(capsys, "calibrate", log_file, *options, tmp_path / "robot.yaml", "--wires", 8)
+    found = run(capsys, "calibrate", log_file, *options, tmp_path / "robot.yaml", "--wires", 4)
     assert {"gain_translation", "play_mm", "latency_s"} <= found["estimates"].keys()
     robot, written = read_robot(tmp_path / "robot.yaml"), read_json(tmp_path / "robot.json")
     assert robot.wire.play_mm == found["estimates"]["play_mm"]["value"] and robot.encoders_at == "motor"
@@ -38,7 +38,7 @@ def test_a_robot_is_calibrated_and_its_log_replayed(vessel, log_file, tmp_path, 
     for name, each in found["estimates"].items():
         (line,) = (line for line in robot.sources if line.startswith(f"{name}: "))
         assert ("not identifiable" in line) != each["identified"]
-    assert found["layer_wire"] == "no gain, left out" and "friction" not in found["estimates"]  # of eight wires
+    assert found["layer_wire"] == "no gain, left out" and "friction" not in found["estimates"]  # of four wires
     assert read_wire(tmp_path / "robot.device.yaml").friction == read_wire("workhorse-014").friction
 
     made = tmp_path / "replay"

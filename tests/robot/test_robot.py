@@ -39,9 +39,7 @@ def test_a_command_is_finite_and_within_limits_whatever_is_asked(translation, ro
 
 
 def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
-    simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
-    simulator.reset(inserted_length=[10.0], rotation=[0.3])
-    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], with_wire(encoder_sd_mm=0.05), seed=3)
+    robot, simulator = held(fork, wire, with_wire(encoder_sd_mm=0.05), seed=3)
     assert isinstance(robot, Robot)
     assert robot.command(((8.0, 0.0),)) == ((8.0, 0.0),)
     robot.run(10 * CYCLE_S)
@@ -74,7 +72,7 @@ def with_wire(**changed) -> RobotConfig:
     return replace(RobotConfig(), wire=replace(RobotConfig().wire, **changed))
 
 
-def ideal(fork, wire, config: RobotConfig, **given) -> tuple[SimulatedRobot, Simulator]:
+def held(fork, wire, config: RobotConfig, **given) -> tuple[SimulatedRobot, Simulator]:
     """Return a robot that holds a wire at 10 mm in a fork."""
     simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
     simulator.reset(inserted_length=[10.0], rotation=[0.3])
@@ -84,7 +82,7 @@ def ideal(fork, wire, config: RobotConfig, **given) -> tuple[SimulatedRobot, Sim
 @pytest.mark.parametrize("at", ["motor", "wire"])
 def test_encoders_in_front_of_play_and_gain_do_not_see_them(fork, wire, at) -> None:
     drive = replace(IDEAL.wire, play_mm=2.4, play_rad=1.0, gain_translation=0.9)
-    robot, simulator = ideal(fork, wire, replace(IDEAL, encoders_at=at, wire=drive), ostium_mm=0.5)
+    robot, simulator = held(fork, wire, replace(IDEAL, encoders_at=at, wire=drive), ostium_mm=0.5)
     robot.command(((3.0, 1.2),))
     robot.run(1.0)  # through the play, wherever the wire lay in it
     lost = 10.0 + 0.9 * 3.0 - robot.proximal[0, 0], 0.3 + 1.2 - robot.proximal[0, 1]
@@ -130,7 +128,7 @@ def test_a_wire_slips_in_the_grip_at_its_force_and_only_an_encoder_on_the_wire_s
 
 
 def test_the_load_is_the_drives_with_noise_and_the_valve_resists_either_way(fork, wire) -> None:
-    robot, simulator = ideal(fork, wire, replace(IDEAL, wire=replace(IDEAL.wire, load_sd_n=0.02, load_sd_n_mm=0.005)))
+    robot, simulator = held(fork, wire, replace(IDEAL, wire=replace(IDEAL.wire, load_sd_n=0.02, load_sd_n_mm=0.005)))
     core = simulator.config
     for speed in (5.0, -5.0):
         robot.command(((speed, 0.0),))
@@ -146,7 +144,7 @@ def test_the_load_is_the_drives_with_noise_and_the_valve_resists_either_way(fork
 def test_what_was_measured_is_kept_beside_what_was_true_and_the_same_seed_repeats_it(fork, wire) -> None:
     kept = []
     for _ in range(2):
-        robot, _ = ideal(fork, wire, replace(with_wire(play_mm=1.0), encoders_at="motor", jitter_s=0.02), seed=4)
+        robot, _ = held(fork, wire, replace(with_wire(play_mm=1.0), encoders_at="motor", jitter_s=0.02), seed=4)
         told = []
         for speed in (4.0, -4.0, 4.0):
             robot.command(((speed, 0.5),))
@@ -168,8 +166,8 @@ def test_a_robot_brings_what_lies_between_its_drives_and_the_ostium(wire) -> Non
     catheter = read_catheter("microcatheter-1.7f")
     behind = Transmission(length_mm=900.0, twist_friction_n_mm_mm=1e-4)
     robot = replace(IDEAL, wire=replace(IDEAL.wire, transmission=behind))
-    held, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())
-    assert held.transmissions == (behind, Transmission()) and held.devices == (wire, catheter)
+    gripped, core = in_grip(Stack(wire, (catheter,)), robot, SimulatorConfig())
+    assert gripped.transmissions == (behind, Transmission()) and gripped.devices == (wire, catheter)
     assert core == SimulatorConfig()  # the wall stays as hard as it was, without a weaker grip
     own = Stack(wire, transmissions=(behind,))
     assert in_grip(own, IDEAL, core) == (own, core)

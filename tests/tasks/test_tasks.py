@@ -193,12 +193,16 @@ def test_bad_input_is_one_line_and_writes_nothing(given, said, tmp_path, monkeyp
 
 
 @pytest.mark.skipif(not EPISODES.exists(), reason="the benchmark's episodes are not at hand")
-def test_every_target_of_the_benchmark_lies_on_a_centerline(tmp_path):
+def test_targets_of_the_benchmark_lie_on_centerlines(tmp_path):
     from steve_tasks import convert  # pyright: ignore[reportMissingImports]
 
-    assert len(convert(EPISODES, tmp_path / "steve")) == 49
+    with np.load(EPISODES) as episodes:
+        seeds = sorted({name[:3] for name in episodes.files})[::16]
+        some = {name: episodes[name] for name in episodes.files if name[:3] in seeds}
+    np.savez(tmp_path / "some.npz", allow_pickle=False, **some)
+    assert convert(tmp_path / "some.npz", tmp_path / "steve") == seeds and len(seeds) == 4
     (task,) = list_tasks(str(tmp_path / "steve"))
-    for place, point in list(enumerate(task.targets_mm or ()))[::16]:
+    for place, point in enumerate(task.targets_mm or ()):
         navigation = task.ladder_navigation(place)
         assert np.linalg.norm(navigation.target.position(navigation.anatomy) - point) < 1.0
 
