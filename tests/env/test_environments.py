@@ -73,6 +73,7 @@ def test_importing_the_package_registers_the_environments_and_not_gymnasium(orde
     code = (
         "import sys, endopilot\nassert not {'gymnasium', 'numpy', 'typing'} & set(sys.modules)\n"
         * order.startswith("e")
+        + "import importlib.util\nimportlib.util.find_spec('gymnasium')\n" * order.startswith("e")  # which only asks
         + f"import {order}\nspec = gymnasium.spec('endopilot/Follow-v2')\n"
         "assert spec.max_episode_steps == 1350\n"
         "endopilot.register_envs()\n"

@@ -55,10 +55,13 @@ class _WithGymnasium:
 
         sys.meta_path.remove(self)
         spec = find_spec(fullname)
+        sys.meta_path.insert(0, self)  # who only asks does not import
         if spec is not None and spec.loader is not None:
             run = spec.loader.exec_module
 
             def and_register(module: ModuleType) -> None:
+                if self in sys.meta_path:
+                    sys.meta_path.remove(self)
                 run(module)
                 register_envs()
 
