@@ -30,6 +30,8 @@ FOLDER = PAGE.parents[2] / "submissions"
 BY_US = FOLDER / "run_by_us"
 """Of files that the workflow made with `--drawn`. Beside them lie the files of their policies, if these are no shipped
 ones: the check lets them decide again, in a process of their own that is handed observations alone."""
+EXAMPLES = FOLDER.parent / "examples"
+"""Where policies of other files may be at hand."""
 LINKS_FILE = "links.yaml"
 HEAD = ("policy", "mark", "tasks", "navigations", "safe success, %", "95 % interval", "exposures", "peak force, N")
 HEAD += ("time, s", "kernel")
@@ -42,16 +44,22 @@ def files() -> list[Path]:
 
 def mark(path: Path, submission: Submission) -> str:
     """Return what a confirmed file may be called."""
-    at_hand = submission.policy in POLICIES.shipped
+    at_hand = submission.policy in POLICIES.shipped or policy_file(submission, EXAMPLES)
     return "run by us" if path.parent == BY_US else "decided again" if at_hand else "replayed"
+
+
+def policy_file(submission: Submission, folder: Path) -> str:
+    """Return FILE:OBJECT of a policy that is no shipped one, where a folder holds its file; else nothing."""
+    module, _, thing = submission.policy.partition(":")
+    file = folder / f"{module}.py"
+    return f"{file}:{thing}" if thing and file.exists() else ""
 
 
 def checked(path: Path, by_us: Path = BY_US) -> tuple[bool, str]:
     """Drive a file again; return whether it may have its mark, and what came of it."""
-    submission, policy = read_submission(path), ""
-    if path.parent == by_us and ":" in submission.policy:
-        module, _, thing = submission.policy.partition(":")
-        policy = LadderConfig(policy=f"{by_us}/{module}.py:{thing}").policy
+    submission = read_submission(path)
+    file = policy_file(submission, by_us if path.parent == by_us else EXAMPLES)
+    policy = LadderConfig(policy=file).policy if file else ""
     found = check_submission(path, policy=policy)
     remarks = "; ".join(filter(None, [found.difference, *found.remarks]))
     if path.parent == by_us and (submission.drawn is None or found.verdict != "decided again"):

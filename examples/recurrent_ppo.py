@@ -2,8 +2,8 @@
 
     pip install -c constraints.txt -e '.[env,learn]'
     python examples/recurrent_ppo.py --minutes 4
-    python examples/recurrent_ppo.py --minutes 60 --tasks 8 --observation state --output state.pt
-    python examples/recurrent_ppo.py --score state.pt
+    python examples/recurrent_ppo.py --minutes 60 --tasks 8 --observation state --output state.npz
+    python examples/recurrent_ppo.py --score state.npz
 
 Without `--tasks` it learns one task in one patient; with it the lowest tasks of the ladder, in 20 training patients
 each. With the observation `xray` seeing costs: between two exposures only encoders and loads of the drives are
@@ -24,13 +24,17 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 import endopilot
-from endopilot.tasks.task import list_tasks
+from endopilot.tasks.task import NEWEST, list_tasks, training_navigations
 
-STEPS, EPOCHS, MINIBATCHES = 64, 4, 4
-GAMMA, LAMBDA, CLIP, LEARNING_RATE, LARGEST_GRADIENT = 0.995, 0.95, 0.2, 5e-4, 0.5
+PERIOD_S = 0.5
+"""Time between two decisions, s, as on the ladder."""
+STEPS, EPOCHS, MINIBATCHES = 16, 4, 4
+GAMMA, LAMBDA, CLIP, LEARNING_RATE, LARGEST_GRADIENT = 0.98, 0.9, 0.2, 5e-4, 0.5
 HIDDEN = 128
-PATIENTS, WORLDS_EACH = 20, 8
+PATIENTS, WORLDS_EACH = 20, 4
 """Patients of each task, and worlds of each patient: worlds of one patient are stepped side by side."""
+TOLD = {"distance_mm": 100.0, "tip_offset": 1.0, "contact_force_max": 0.1, "tip_abscissa": 100.0}
+"""What the critic is told of the truth besides, and a usual size of each: the actor has to do with what it sees."""
 
 
 class Agent(nn.Module):
@@ -38,24 +42,28 @@ class Agent(nn.Module):
 
     def __init__(self, observed: int, actions: int) -> None:
         super().__init__()
-        self.given = observed, actions
         self.encoder = nn.Sequential(nn.Linear(observed, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, HIDDEN), nn.Tanh())
         self.memory = nn.GRUCell(HIDDEN, HIDDEN)
-        self.actor, self.critic = nn.Linear(HIDDEN, actions), nn.Linear(HIDDEN, 1)
-        self.log_std = nn.Parameter(torch.full((actions,), -0.5))
+        self.actor = nn.Linear(HIDDEN, actions)
+        self.critic = nn.Sequential(nn.Linear(HIDDEN + len(TOLD), HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 1))
+        self.log_std = nn.Parameter(torch.tensor([-1.2, -1.2, -0.5][:actions]))  # of moves, and of when to look
         with torch.no_grad():
             self.actor.weight.mul_(0.01)
             self.actor.bias.zero_()
             if actions == 3:
-                self.actor.bias[-1] = -1.0  # at first one step in twenty asks for an exposure, and not one in two
+                self.actor.bias[-1] = -0.3  # at first one step in three asks for an exposure
 
     def remember(self, observation: torch.Tensor, memory: torch.Tensor, begun: torch.Tensor) -> torch.Tensor:
         """Return the memory after an observation; where an episode has begun, nothing is remembered from before."""
         return self.memory(self.encoder(observation), memory * (1.0 - begun[:, None]))
 
-    def decide(self, memory: torch.Tensor) -> tuple[torch.distributions.Normal, torch.Tensor]:
-        """Return the distribution of actions, and the value."""
-        return torch.distributions.Normal(self.actor(memory), self.log_std.exp()), self.critic(memory)[..., 0]
+    def decide(self, memory: torch.Tensor) -> torch.distributions.Normal:
+        """Return the distribution of actions."""
+        return torch.distributions.Normal(self.actor(memory), self.log_std.exp())
+
+    def value(self, memory: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
+        """Return what is expected of the rest of the episode, by one who is told how it stands."""
+        return self.critic(torch.cat([memory, told], dim=-1))[..., 0]
 
 
 class Rollout:
@@ -65,7 +73,7 @@ class Rollout:
         self.observations = torch.zeros(STEPS, worlds, observed)
         self.actions = torch.zeros(STEPS, worlds, actions)
         self.begun, self.log_prob, self.values, self.rewards, self.ended = torch.zeros(5, STEPS, worlds)
-        self.memory = torch.zeros(worlds, HIDDEN)
+        self.memory, self.told = torch.zeros(worlds, HIDDEN), torch.zeros(STEPS, worlds, len(TOLD))
 
     def advantages(self, last_value: torch.Tensor) -> torch.Tensor:
         """Return generalised advantages. Time is observed, so its end is an end like any other."""
@@ -81,9 +89,10 @@ class Rollout:
 class Player:
     """Plays episodes in many worlds, and keeps what became of each: seconds, return, safe success, exposures."""
 
-    def __init__(self, worlds: endopilot.NavigateVectorEnv, seed: int) -> None:
-        self.worlds, self.episodes, self.began = worlds, [], time.monotonic()
-        self.observation = torch.as_tensor(worlds.reset(seed=seed)[0])
+    def __init__(self, worlds: endopilot.NavigateVectorEnv, seed: int, dearer: float) -> None:
+        self.worlds, self.dearer, self.episodes, self.began = worlds, dearer, [], time.monotonic()
+        observation, info = worlds.reset(seed=seed)
+        self.observation, self.told = torch.as_tensor(observation), _told(info)
         self.begun = torch.ones(worlds.num_envs)
         self.memory = torch.zeros(worlds.num_envs, HIDDEN)
         self.returns = np.zeros(worlds.num_envs)
@@ -93,17 +102,17 @@ class Player:
         """Fill a rollout; return the values of what comes after it."""
         rollout.memory = self.memory
         for t in range(STEPS):
-            rollout.observations[t], rollout.begun[t] = self.observation, self.begun
+            rollout.observations[t], rollout.told[t], rollout.begun[t] = self.observation, self.told, self.begun
             self.memory = agent.remember(self.observation, self.memory, self.begun)
-            chances, rollout.values[t] = agent.decide(self.memory)
+            chances, rollout.values[t] = agent.decide(self.memory), agent.value(self.memory, self.told)
             rollout.actions[t] = action = chances.sample()
             rollout.log_prob[t] = chances.log_prob(action).sum(-1)
             rollout.rewards[t], rollout.ended[t] = self._step(action.numpy())
-        _, value = agent.decide(agent.remember(self.observation, self.memory, self.begun))
-        return value
+        return agent.value(agent.remember(self.observation, self.memory, self.begun), self.told)
 
     def _step(self, action: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         observation, reward, terminated, truncated, info = self.worlds.step(action)
+        reward = reward - self.dearer * (action[:, 2:] > 0.0).sum(axis=-1)
         ended = terminated | truncated
         self.returns += reward
         for world in np.flatnonzero(ended):
@@ -112,7 +121,8 @@ class Player:
             exposures = int(last["exposures"][world]) if "exposures" in last else 0
             self.episodes.append((now, self.returns[world], safe, exposures))
         self.returns[ended] = 0.0
-        self.observation, self.begun = torch.as_tensor(observation), torch.as_tensor(ended, dtype=torch.float32)
+        self.observation, self.told = torch.as_tensor(observation), _told(info)
+        self.begun = torch.as_tensor(ended, dtype=torch.float32)
         return torch.as_tensor(reward, dtype=torch.float32), self.begun
 
 
@@ -127,7 +137,8 @@ def improve(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, la
             for t in range(STEPS):
                 memory = agent.remember(rollout.observations[t, part], memory, rollout.begun[t, part])
                 remembered.append(memory)
-            chances, values = agent.decide(torch.stack(remembered))
+            known = torch.stack(remembered)
+            chances, values = agent.decide(known), agent.value(known, rollout.told[:, part])
             log_prob = chances.log_prob(rollout.actions[:, part]).sum(-1)
             ratio, advantage = (log_prob - rollout.log_prob[:, part]).exp(), advantages[:, part]
             gain = torch.minimum(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
@@ -138,13 +149,19 @@ def improve(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, la
             optimizer.step()
 
 
-def train(worlds: endopilot.NavigateVectorEnv, seconds: float, seed: int) -> tuple[Agent, np.ndarray]:
-    """Train for some seconds, at least one rollout; return the agent, and a row for each episode (see `Player`)."""
-    torch.manual_seed(seed)
+def train(worlds: endopilot.NavigateVectorEnv, asked: argparse.Namespace) -> np.ndarray:
+    """Train as asked, at least one rollout; return a row for each episode (see `Player`).
+
+    Every half minute the agent and these are written, so that an end before the end loses little.
+    """
+    seconds = 60.0 * asked.minutes
+    torch.manual_seed(asked.seed)
     observed, actions = worlds.single_observation_space.shape[0], worlds.single_action_space.shape[0]
     agent, rollout = Agent(observed, actions), Rollout(worlds.num_envs, observed, actions)
+    if asked.start:
+        agent.load_state_dict(read(asked.start)[0])
     optimizer = torch.optim.Adam(agent.parameters())
-    player, steps, said, now = Player(worlds, seed), 0, 0.0, 0.0
+    player, steps, said, now = Player(worlds, asked.seed, asked.dearer), 0, 0.0, 0.0
     while steps == 0 or now < seconds:
         optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(1.0 - now / max(seconds, 1.0), 0.05)
         improve(agent, optimizer, rollout, player.play(agent, rollout))
@@ -152,9 +169,27 @@ def train(worlds: endopilot.NavigateVectorEnv, seconds: float, seed: int) -> tup
         now = time.monotonic() - player.began
         if player.episodes and now > said + 30.0:
             said = now
+            write(agent, player.episodes, asked.tasks, asked.output)
             last = np.array(player.episodes[-worlds.num_envs :], dtype=float)
             print(f"{now:5.0f} s, {steps} steps: {_described(last)}", flush=True)
-    return agent, np.array(player.episodes, dtype=float).reshape(-1, 4)
+    write(agent, player.episodes, asked.tasks, asked.output)
+    return np.array(player.episodes, dtype=float).reshape(-1, 4)
+
+
+def write(agent: Agent, episodes: list[tuple], tasks: int, path: Path | None) -> None:
+    """Write a policy and what became of its episodes, if a path is given."""
+    if path is not None:
+        kept = {name: values.numpy() for name, values in agent.state_dict().items()}
+        np.savez_compressed(path, tasks=tasks, period_s=PERIOD_S, **kept)
+        header = "s,return,safe,exposures"
+        np.savetxt(path.with_suffix(".csv"), np.array(episodes), "%.4g", ",", header=header, comments="")
+
+
+def read(path: Path) -> tuple[dict[str, torch.Tensor], int, float]:
+    """Return the weights of a policy, the number of tasks that it has learned, and the time between its decisions."""
+    with np.load(path) as file:
+        weights = {name: torch.as_tensor(file[name]) for name in file.files}
+    return weights, int(weights.pop("tasks")), float(weights.pop("period_s"))
 
 
 @torch.no_grad()
@@ -165,22 +200,21 @@ def score(path: Path) -> list[tuple[str, int, int, int, float]]:
         For each task its name, safe successes, successes, navigations, and mean exposures (0 where all is observed).
     """
     torch.manual_seed(0)
-    saved, scores = torch.load(path), []
-    agent, observation = Agent(*saved["given"]), "xray" if saved["given"][1] == 3 else "state"
-    agent.load_state_dict(saved["weights"])
-    for task in list_tasks()[: saved["tasks"]]:
+    saved, tasks, period_s = read(path)
+    actions = len(saved["log_std"])
+    agent, scores = Agent(saved["encoder.0.weight"].shape[1], actions), []
+    agent.load_state_dict(saved, strict=False)
+    observation = "xray" if actions == 3 else "state"
+    for task in list_tasks()[:tasks]:
         given = [task.ladder_navigation(place) for place in range(len(task.ladder.numbers))]
-        worlds = _worlds(len(given), observation, navigations=given)
+        worlds = _worlds(len(given), observation, period_s, navigations=given)
         seen, begun = torch.as_tensor(worlds.reset(seed=0)[0]), torch.ones(len(given))
-        memory, going, exposures = (
-            torch.zeros(len(given), HIDDEN),
-            np.ones(len(given), dtype=bool),
-            np.zeros(len(given)),
-        )
+        memory, going = torch.zeros(len(given), HIDDEN), np.ones(len(given), dtype=bool)
+        exposures = np.zeros(len(given))
         success, safe = np.zeros((2, len(given)), dtype=bool)
         while going.any():
             memory, begun = agent.remember(seen, memory, begun), torch.zeros_like(begun)
-            chances, _ = agent.decide(memory)
+            chances = agent.decide(memory)
             action = chances.mean
             action[:, 2:] = chances.sample()[:, 2:]  # when to look is drawn: the mean would look always or never
             after, _, terminated, truncated, info = worlds.step(action.numpy())
@@ -194,8 +228,14 @@ def score(path: Path) -> list[tuple[str, int, int, int, float]]:
     return scores
 
 
-def _worlds(count: int, observation: str, **given: object) -> endopilot.NavigateVectorEnv:
-    return endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=AutoresetMode.SAME_STEP, **given)
+def _worlds(count: int, observation: str, period_s: float, **given: object) -> endopilot.NavigateVectorEnv:
+    mode = AutoresetMode.SAME_STEP
+    return endopilot.NavigateVectorEnv(count, observation=observation, autoreset_mode=mode, period_s=period_s, **given)
+
+
+def _told(info: dict[str, np.ndarray]) -> torch.Tensor:
+    values = np.stack([info[name] / size for name, size in TOLD.items()], axis=-1)
+    return torch.as_tensor(np.clip(values, -5.0, 5.0), dtype=torch.float32)
 
 
 def _described(episodes: np.ndarray) -> str:
@@ -211,6 +251,8 @@ def main() -> None:
     parser.add_argument("--observation", choices=("xray", "state"), default="xray")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--start", type=Path, help="go on from a policy that was written before")
+    parser.add_argument("--dearer", type=float, default=0.0, help="what an exposure costs besides the reward's 0.05")
     parser.add_argument("--score", type=Path)
     asked = parser.parse_args()
     if asked.output and not asked.tasks:
@@ -223,20 +265,17 @@ def main() -> None:
     if asked.output:
         asked.output.parent.mkdir(parents=True, exist_ok=True)
     if asked.tasks:
-        given = [task.learning_navigation(place) for task in list_tasks()[: asked.tasks] for place in range(PATIENTS)]
-        worlds = _worlds(WORLDS_EACH * len(given), asked.observation, navigations=given)
+        names = [task.name for task in list_tasks()[: asked.tasks]]
+        given = [each for name in names for each in training_navigations(name, 0, PATIENTS, NEWEST)]
+        worlds = _worlds(WORLDS_EACH * len(given), asked.observation, PERIOD_S, navigations=given)
     else:
-        worlds = _worlds(64, asked.observation)
-    agent, episodes = train(worlds, 60.0 * asked.minutes, asked.seed)
-    if asked.output:
-        torch.save({"given": agent.given, "tasks": asked.tasks, "weights": agent.state_dict()}, asked.output)
-        np.savetxt(
-            asked.output.with_suffix(".csv"), episodes, "%.4g", ",", header="s,return,safe,exposures", comments=""
-        )
+        worlds = _worlds(64, asked.observation, PERIOD_S)
+    episodes = train(worlds, asked)
     fifth = max(len(episodes) // 5, 1)
     for name, part in (("first", episodes[:fifth]), ("last", episodes[-fifth:])):
         print(f"{name} fifth of {len(episodes)} episodes: {_described(part)}")
-    assert episodes[-fifth:, 1].mean() > episodes[:fifth, 1].mean() + 1.0, "nothing was learned; give it more minutes"
+    risen = episodes[-fifth:, 1].mean() > episodes[:fifth, 1].mean() + 1.0
+    assert risen or asked.start, "nothing was learned; give it more minutes"
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ from endopilot.tasks.task import (
     LadderVersion,
     Task,
     list_tasks,
-    without_catheter,
 )
 from endopilot.types import TipProjection, VesselTree
 
@@ -182,7 +181,7 @@ def wire_alone_fails(navigation: Navigation) -> bool:
 
 def suits(navigation: Navigation) -> bool:
     """Return whether the target can be reached, and with a catheter is not by pushing its wire alone."""
-    alone = without_catheter(navigation)
+    alone = replace(navigation, catheters=(), arrives="wire", start_catheter_mm=0.0)
     if navigation.catheters and not wire_alone_fails(alone):
         return False
     shaped = any(catheter.shape for catheter in navigation.catheters)

@@ -13,9 +13,8 @@ from jaxtyping import Float
 
 from benchmarks.figures import Bar, judged
 from benchmarks.imaging.scenes import Scene, SceneConfig, draw_scene
-from benchmarks.imaging.xray import SHOWN, Exposure, errors_of, summary
+from benchmarks.imaging.xray import SHOWN, Exposure, errors_of, summary, view_text
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.draw import view_text
 from endopilot.files import read_json, write_json
 from endopilot.runs import OutputFolder, claim
 from endopilot.settings import NonNegative, Seed, Within, settings

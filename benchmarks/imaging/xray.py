@@ -14,7 +14,6 @@ import numpy as np
 from benchmarks.figures import Bar, judged
 from benchmarks.imaging.scenes import Scene, SceneConfig, Signal, draw_scenes
 from endopilot.anatomy.projection import project_tip
-from endopilot.angiograms.draw import view_text
 from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import Motion, draw_motion, place, published_mean
 from endopilot.types import Anatomy
@@ -52,6 +51,13 @@ Case = tuple[int | None, float, float, tuple[int, ...]]
 Row = TypeVar("Row", bound="Exposure")
 _OF_95 = 2.795
 """Standard deviations within which 95 % of normally distributed errors in space lie."""
+
+
+def view_text(angles_deg: Sequence[float]) -> str:
+    """Return a view as clinics write it, such as "LAO 45 CRAN 20"."""
+    lao, cranial = angles_deg
+    side, tilt = ("LAO" if lao >= 0 else "RAO"), ("CRAN" if cranial >= 0 else "CAUD")
+    return f"{side} {abs(lao):.0f}" + (f" {tilt} {abs(cranial):.0f}" if cranial else "")
 
 
 @settings

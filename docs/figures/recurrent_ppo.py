@@ -1,7 +1,7 @@
 """Score the policies of `examples/recurrent_ppo.py`, and draw how they learned.
 
-`python docs/figures/recurrent_ppo.py FOLDER`: FOLDER holds what the example wrote, state.pt, state.csv, xray.pt and
-xray.csv. The table goes into docs/evidence/environments.md, the curves into docs/images/recurrent_ppo.png.
+`python docs/figures/recurrent_ppo.py FOLDER`: FOLDER holds what the example wrote, state.npz, xray.npz, and of the runs
+that are drawn a .csv. The table goes into docs/evidence/environments.md, the curves into docs/images/recurrent_ppo.png.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ POLICIES = {"state": "all is observed", "xray": "seeing costs"}
 def table(folder: Path) -> list[str]:
     """Return the scores in the ladder's patients."""
     score = runpy.run_path(str(EXAMPLE))["score"]
-    scores = {name: score(folder / f"{name}.pt") for name in POLICIES if (folder / f"{name}.pt").exists()}
+    scores = {name: score(folder / f"{name}.npz") for name in POLICIES if (folder / f"{name}.npz").exists()}
     titles = [POLICIES[name] for name in scores] + ["exposures"]
     lines = [f"| task | {' | '.join(titles)} |", "|---" * (1 + len(titles)) + "|"]
     for rows in zip(*scores.values(), strict=True):
@@ -42,6 +42,8 @@ def draw(folder: Path, path: Path) -> None:
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     safe, seen = figure.subplots(1, 2)
     for name, title in POLICIES.items():
+        if not (folder / f"{name}.csv").exists():
+            continue
         seconds, _, success, exposures = np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1).T
         width = max(len(seconds) // 8, 1)  # episodes that run out of time end in bursts
         mean, minutes = np.ones(width) / width, seconds[width - 1 :] / 60

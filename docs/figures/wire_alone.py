@@ -7,6 +7,7 @@ kept. The simple policies drive in all patients of a task, the agent in the firs
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score_navigations
 from endopilot.runs import make_missing
-from endopilot.tasks.task import Task, find_task, list_tasks, without_catheter
+from endopilot.tasks.task import Task, find_task, list_tasks
 
 SIMPLE, PLANS = ("forward", "spin"), "agent"
 
@@ -26,7 +27,7 @@ def navigate(path: Path) -> None:
     """Let a policy drive the wire of a task without its catheter, from the task's start and with its seed."""
     policy, name, place = path.parts[-3], path.parts[-2], int(path.stem)
     task = find_task(name, version="coaxial")
-    navigation = without_catheter(task.ladder_navigation(place))
+    navigation = replace(task.ladder_navigation(place), catheters=(), arrives="wire", start_catheter_mm=0.0)
     write_json(path, attempt(policy, navigation, seed=navigation_seed(task, place)))
 
 

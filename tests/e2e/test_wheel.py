@@ -101,7 +101,8 @@ def test_the_sdist_holds_the_package_and_what_builds_it(dist: Path) -> None:
 @needs_release
 def test_the_wheel_holds_the_whole_package(wheel: Path) -> None:
     files = packaged()
-    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("endopilot/")}
+    names = [each.filename for each in zipfile.ZipFile(wheel).infolist() if not each.is_dir()]
+    held = {name for name in names if name.startswith("endopilot/")}
     assert files - held == set()
     core = held - files
     assert core and all(re.fullmatch(r"endopilot/_core\w*\.[\w.-]+\.so", name) for name in core)
@@ -118,5 +119,4 @@ def test_it_simulates_and_plans(clean: Path) -> None:
 def test_the_command_line_answers(clean: Path) -> None:
     assert run(clean, "endopilot", "--version").stdout == f"endopilot {__version__}\n"
     assert "endopilot COMMAND" in run(clean, "endopilot", "--help").stdout
-    extras = json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"]
-    assert not any(extras.values())
+    assert json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"] == "-"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,13 +56,6 @@ def draw_view(random: np.random.Generator, anatomy: Anatomy) -> tuple[str, tuple
     name = list(views)[int(random.integers(len(views)))]
     lao, cranial = (round(float(random.uniform(*bounds)), 1) for bounds in views[name])
     return name, (lao, cranial)
-
-
-def view_text(angles_deg: Sequence[float]) -> str:
-    """Return a view as clinics write it, such as "LAO 45 CRAN 20"."""
-    lao, cranial = angles_deg
-    side, tilt = ("LAO" if lao >= 0 else "RAO"), ("CRAN" if cranial >= 0 else "CAUD")
-    return f"{side} {abs(lao):.0f}" + (f" {tilt} {abs(cranial):.0f}" if cranial else "")
 
 
 _MARGIN = 0.15

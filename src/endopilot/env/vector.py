@@ -108,7 +108,7 @@ class NavigateVectorEnv(VectorEnv):
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
         render_mode: Literal["rgb_array"] | None = None,
-        period_s: Annotated[float, Within(0.05, 1.0)] = CONTROL_PERIOD_S,
+        period_s: Annotated[float, Within(0.0, 2.0, above_low=True)] = CONTROL_PERIOD_S,
         max_episode_steps: int | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.

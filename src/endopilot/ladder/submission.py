@@ -227,7 +227,7 @@ def read_submission(path: str | Path) -> Submission:
                 raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
     own = key_of(submission.terms, counts)
     for name in dict.fromkeys([*own, *submission.key]):
-        said, follows = (json_text(key.get(name)) for key in (submission.key, own))
+        said, follows = (json_text(key.get(name), indented=False) for key in (submission.key, own))
         if said != follows:
             raise InputError(
                 f"{path}: key.{name}: {said}; from all else follows {follows}: give the file as it was written, or "

@@ -262,11 +262,6 @@ def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation
     return [replace(navigation, catheters=(catheter,), arrives="catheter") for navigation in navigations]
 
 
-def without_catheter(navigation: Navigation) -> Navigation:
-    """Return a navigation to the same target by its wire alone, whose tip is to arrive."""
-    return replace(navigation, catheters=(), arrives="wire", start_catheter_mm=0.0)
-
-
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
