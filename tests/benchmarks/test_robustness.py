@@ -35,12 +35,7 @@ def patient():
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate chunks here: a process takes seconds to start."""
-
-    class Here(robustness._Worker):
-        def run(self, *chunk):
-            robustness.run_chunk(*chunk)
-
-    monkeypatch.setattr(robustness, "_Worker", Here)
+    monkeypatch.setattr(robustness._Worker, "run", lambda worker, *chunk: robustness.run_chunk(*chunk))
 
 
 def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path, in_this_process) -> None:
