@@ -120,3 +120,10 @@ def test_the_command_line_answers(clean: Path) -> None:
     assert run(clean, "endopilot", "--version").stdout == f"endopilot {__version__}\n"
     assert "endopilot COMMAND" in run(clean, "endopilot", "--help").stdout
     assert json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"] == "-"
+
+
+@needs_release
+def test_a_command_without_its_extra_says_so_in_one_line(clean: Path) -> None:
+    result = run(clean, "endopilot", "train", clean.parent, "-o", "run")
+    assert result.returncode == 2
+    assert result.stderr == "endopilot train: needs torch; install it with: pip install 'endopilot[learn]'\n"

@@ -23,10 +23,9 @@ def test_it_decides_what_the_network_does_in_an_environment() -> None:
     record = NavigationLoop(navigation, given["Recurrent"](), seed=1).run()
     observed = runpy.run_path(str(EXAMPLES / "offline_sets.py"))["_observed"]
     seen = torch.as_tensor(observed(navigation, record))
-    with np.load(given["WEIGHTS"]) as file:
-        weights = {name: torch.as_tensor(file[name]) for name in file.files if name not in ("tasks", "period_s")}
-    agent = runpy.run_path(str(EXAMPLES / "recurrent_ppo.py"))["Agent"](seen.shape[1], 3)
-    agent.load_state_dict(weights, strict=False)
+    learner = runpy.run_path(str(EXAMPLES / "recurrent_ppo.py"))
+    agent = learner["Agent"](seen.shape[1], 3)
+    agent.load_state_dict(learner["read"](given["WEIGHTS"])[0])
     memory, moves, random = torch.zeros(1, len(agent.memory.weight_hh[0])), [], np.random.default_rng(1)
     with torch.no_grad():
         for each in seen[:-1]:
