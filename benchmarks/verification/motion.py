@@ -115,6 +115,7 @@ def wire_in_bend(motion: _core.Motion | None, *, hold_s: float) -> Moved:
             record_attitude=False,
             threads=1,
             lanes=1,
+            chosen=np.arange(1),
             progress=None,
         )
         found.append([part[0] for part in (simulation.positions(), simulation.attitudes(), simulation.contacts())])

@@ -311,14 +311,17 @@ void reset(Simulations& s, const Indices<1>& index, const Array<3>& initial, con
     }
 }
 
-// Steps all worlds, with the interpreter's lock released, and returns what `OUTPUTS` lists.
+// Steps the worlds `chosen`, with the interpreter's lock released, and returns what `OUTPUTS` lists: 0 of the others.
 nb::dict run(Simulations& s, const Array<4>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
-             bool record_attitude, int threads, int lanes, const nb::object& progress) {
+             bool record_attitude, int threads, int lanes, const Indices<1>& chosen, const nb::object& progress) {
     const std::size_t samples = control.shape(1);
     require(control.shape(0) == s.count() && control.shape(2) == s.devices() && control.shape(3) == 2, "control needs two numbers a world, sample and device");
     require(s.devices() == 1 || !force_driven, "devices with catheters are not driven by force");
     require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
-    const Inputs in{.samples = int(samples),
+    const std::vector<int> worlds(chosen.data(), chosen.data() + chosen.size());
+    for (const int w : worlds) require(w >= 0 && std::size_t(w) < s.count(), "run names no such world");
+    const Inputs in{.worlds = int(s.count()),
+                    .samples = int(samples),
                     .steps_per_sample = steps_per_sample,
                     .time_step = time_step,
                     .force_driven = force_driven,
@@ -337,7 +340,7 @@ nb::dict run(Simulations& s, const Array<4>& control, bool force_driven, double 
         result[name] = made.array;
     });
     const nb::gil_scoped_release release;
-    s.step(in, out, threads, lanes, [&](long ended) {
+    s.step(in, worlds, out, threads, lanes, [&](long ended) {
         const nb::gil_scoped_acquire acquire;
         if (PyErr_CheckSignals() != 0) throw nb::python_error();
         if (!progress.is_none() && ended > 0) progress(ended);
@@ -460,7 +463,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
              nb::arg("transmission").none() = nb::none(), nb::arg("worlds"))
         .def("reset", &reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
         .def("run", &run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"), nb::arg("steps_per_sample"),
-             nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"), nb::arg("lanes"), nb::arg("progress").none())
+             nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"), nb::arg("lanes"), nb::arg("chosen"), nb::arg("progress").none())
         .def("state", &state)
         .def("set_state", &set_state, nb::arg("all"))
         .def("tips", &tips)

@@ -48,7 +48,7 @@ public:
     void step(const Worlds& worlds, const Inputs& in, const Outputs& out, std::vector<int> order, int threads, int lanes,
               const Progress& progress) {
         std::vector<double> length;
-        for (std::size_t w = 0; w < order.size(); ++w) length.push_back(worlds[w][World::kActive]);
+        for (int w = 0; w < in.worlds; ++w) length.push_back(worlds[std::size_t(w)][World::kActive]);
         const Run run{scene_, worlds, in, out};
         threads = std::max(1, threads);
         WorkQueue queue(std::move(order), std::move(length), kUnderWay * threads);

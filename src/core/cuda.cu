@@ -92,11 +92,11 @@ CudaStepper::~CudaStepper() = default;
 
 void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order, int, int,
                        const Progress& progress) {
-    const std::size_t count = order.size(), samples = std::size_t(in.samples), devices = std::size_t(scene_.drives.count);
+    const std::size_t count = std::size_t(in.worlds), samples = std::size_t(in.samples), devices = std::size_t(scene_.drives.count);
     const std::size_t width = World::size(scene_.rod.nodes, scene_.drives.count);
     Memory memory;
     Launch launch{.run = {scene_, {}, in, out},
-                  .count = int(count),
+                  .count = int(order.size()),
                   .order = memory(order),
                   .next = memory(std::vector<int>(count, 0)),
                   .samples = kSamplesPerLaunch};
@@ -129,13 +129,13 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
 
     const long steps = long(most) + in.samples, launches = (steps + kSamplesPerLaunch - 1) / kSamplesPerLaunch;
     cudaLaunchConfig_t grid{};
-    grid.gridDim = dim3(unsigned(count + kBlock - 1) / kBlock);
+    grid.gridDim = dim3(std::max(1u, unsigned(order.size() + kBlock - 1) / kBlock));
     grid.blockDim = dim3(kBlock);
     long done = 0;
     for (long k = 1; k <= launches; ++k) {
         check(cudaLaunchKernelEx(&grid, kernel_for(scene_.rod.nodes, scene_.drives.count), launch));
         check(cudaDeviceSynchronize());
-        const long now = long(count) * in.samples * k / launches;
+        const long now = long(order.size()) * in.samples * k / launches;
         progress(now - done);
         done = now;
     }

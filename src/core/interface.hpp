@@ -153,7 +153,7 @@ constexpr int kTicks = 64;   // of a time step, which may be halved down to one
 
 // The inputs of one run: samples of equal length, each with one control for each world.
 struct Inputs {
-    int samples, steps_per_sample;
+    int worlds, samples, steps_per_sample;
     double time_step;         // s
     bool force_driven;        // controls are an axial force and a torque on the wire, not velocities
     const double* control;    // worlds × samples × devices × 2: mm/s and rad/s, or N and N mm

@@ -2,7 +2,7 @@
 #pragma once
 
 #include <algorithm>
-#include <numeric>
+#include <utility>
 #include <vector>
 
 #include "world.hpp"
@@ -24,8 +24,9 @@ public:
     std::vector<double>& values() { return values_; }   // of all worlds, one after the other
     Worlds worlds() { return {values_.data(), std::ptrdiff_t(width()), 1, scene_.drives.count}; }
 
-    void step(const Inputs& in, const Outputs& out, int threads, int lanes, const Progress& progress) {
-        processor_.step(worlds(), in, out, by_depth(in), threads, lanes, progress);
+    // Steps the worlds that are `chosen`; the others stay as they are, and so do their outputs.
+    void step(const Inputs& in, std::vector<int> chosen, const Outputs& out, int threads, int lanes, const Progress& progress) {
+        processor_.step(worlds(), in, out, by_depth(in, std::move(chosen)), threads, lanes, progress);
     }
 
 private:
@@ -35,8 +36,8 @@ private:
     std::vector<double> values_;
     Processor processor_{scene_};
 
-    // The worlds in the order of their mean inserted length, so that those under way together are of similar length.
-    std::vector<int> by_depth(const Inputs& in) {
+    // Worlds in the order of their mean inserted length, so that those under way together are of similar length.
+    std::vector<int> by_depth(const Inputs& in, std::vector<int> order) {
         std::vector<double> depth;
         for (std::size_t w = 0; w < count_; ++w) {
             const World start = worlds()[w];
@@ -47,8 +48,6 @@ private:
             }
             depth.push_back(sum);
         }
-        std::vector<int> order(count_);
-        std::iota(order.begin(), order.end(), 0);
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
         return order;
     }

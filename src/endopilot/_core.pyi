@@ -133,6 +133,7 @@ class Simulation:
         record_attitude: bool,
         threads: int,
         lanes: int,
+        chosen: np.ndarray,
         progress: Callable[[int], Any] | None,
     ) -> dict[str, np.ndarray]: ...
     def state(self) -> np.ndarray: ...

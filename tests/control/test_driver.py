@@ -80,6 +80,14 @@ def test_a_wire_slows_down_before_the_target_and_stops_there(side_branch) -> Non
     assert outcome.share[0] == 1.0 and speed[0] == CONFIG.speed_mm_s > speed[-1] and outcome.to_go[0] <= 1.5
 
 
+def test_a_wire_that_comes_to_the_target_on_the_way_to_its_place_has_arrived(side_branch) -> None:
+    """What it would do there, as to be retracted, leads away from the target."""
+    straight = replace(side_branch, target=replace(side_branch.target, branch=0, abscissa=14.0))
+    outcome = drive(straight, Row(at=(-1.5,), back=(2.0,)), 14.0)
+    assert outcome.share[0] == 1.0 and outcome.to_go[0] <= 2.0
+    assert (outcome.controls_of(0)[:, WIRE, 0] > 0).all()
+
+
 def outcome_of(turn: np.ndarray, share: np.ndarray, **differs: np.ndarray) -> Outcome:
     """Return what became of made-up trials."""
     n, none = len(turn), np.zeros(len(turn))

@@ -67,7 +67,7 @@ int main() {
     for (int sample = 0; sample < kSamples; ++sample) {
         std::vector<double> controls;
         for (int w = 0; w < kWorlds; ++w) controls.insert(controls.end(), {control[(sample + w) % kSamples][0], control[(sample + w) % kSamples][1]});
-        const Inputs in{.samples = 1, .steps_per_sample = kSteps, .time_step = kPeriod / kSteps, .force_driven = false, .control = controls.data()};
+        const Inputs in{.worlds = kWorlds, .samples = 1, .steps_per_sample = kSteps, .time_step = kPeriod / kSteps, .force_driven = false, .control = controls.data()};
         const Run run{scene, worlds, in, out};
         Lanes<double4, 0> lanes(node.data(), factor.data());
         WorkQueue queue({0, 1, 2, 3}, std::vector<double>(kWorlds, 0.0), kWorlds);

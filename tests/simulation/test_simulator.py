@@ -128,6 +128,23 @@ def test_lanes_that_wait_for_a_slower_world_count_as_evaluations(anatomy: Anatom
     assert alike.evaluations(step) == 2 * 8 * 100
     slow = replace(step, node_iterations=np.array([1000.0, *[10.0] * 8]))
     assert alike.evaluations(slow) == 8 * 1000
+    alone = replace(step, node_iterations=np.array([1000.0, *[0.0] * 8]))
+    assert alike.evaluations(alone) == 4 * 1000
+
+
+def test_worlds_that_are_not_driven_stay_as_they_are_and_the_others_move_as_ever(anatomy: Anatomy) -> None:
+    """Of two groups one has a single world that moves, and one none."""
+    devices = [DEVICE, STIFF, DEVICE, DEVICE, STIFF]
+    some, everyone = (begun(Simulator(anatomy, devices), 5) for _ in range(2))
+    before, moves = some.position.copy(), np.array([False, False, True, True, False])
+    for control in controls(3, 5):
+        step, wanted = some.step(control, PERIOD, worlds=moves), everyone.step(control, PERIOD)
+        assert np.array_equal(step.tip_position[moves], wanted.tip_position[moves])
+        assert not any(np.any(getattr(step, name)[~moves]) for name in ("tip_position", "contact_force_max", "valid"))
+    assert np.array_equal(some.position[~moves], before[~moves])
+    assert np.array_equal(some.position[moves], everyone.position[moves])
+    assert not np.array_equal(some.position, everyone.position)
+    assert some.time[moves] == pytest.approx(some.time[~moves][0] + 3 * PERIOD)
 
 
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:

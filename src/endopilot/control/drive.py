@@ -253,7 +253,8 @@ class Driver:
             been = goal.passed(trials) | (been & goal.last)
             self._stop(pushing & _slips(trials, before) & self._alone, "slipped")
             ends = pushing & (self._alone | np.isnan(self._motions.follow_mm))  # others pass once they rest
-            passed |= going & ends & ~trials.still & goal.suffices(trials.mean(been))
+            arrives = ends | (self._alone & goal.last)  # at its target, whatever it was doing
+            passed |= going & arrives & ~trials.still & goal.suffices(trials.mean(been))
             trials.still |= passed
             self._stop(ends & (progress >= goal.at_mm + _BEYOND_MM), "off")
             if passed.any():

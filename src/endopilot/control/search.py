@@ -220,8 +220,9 @@ class Search:
         passes = gentle & (outcome.share >= agree - ROUNDING)
         cost = outcome.expected_cost(limit_n)
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
-            for pauses in (False, True):
-                self._repeat(outcome, trial, pauses=pauses)
+            paused = not outcome.controls_of(trial).any(axis=(1, 2)).all()
+            for pauses in (False, True)[: 1 + paused]:
+                self._repeat(outcome, trial, pauses=pauses, force_n=force_n)
                 there, done = goal.passed(course) * course.weight, course.rows[len(self._kept.rows) :]
                 pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
                 enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
@@ -238,12 +239,15 @@ class Search:
         self._repeat(outcome, int(np.argmin(left)), pauses=True, most=row.draws.kept)
         return True
 
-    def _repeat(self, outcome: Outcome, trial: int, *, pauses: bool, most: int | None = None) -> None:
-        """Let the course do what a trial did, with or without the periods in which nothing moves."""
+    def _repeat(
+        self, outcome: Outcome, trial: int, *, pauses: bool, most: int | None = None, force_n: float = np.inf
+    ) -> None:
+        """Let the course do what a trial did, with or without the periods in which nothing moves, until a wire that
+        counts presses with more than a force, N."""
         self._course.restore(self._kept)
         for control in outcome.controls_of(trial)[:most]:
-            if pauses or control.any():
-                self._course.move(control[None])
+            if (pauses or control.any()) and self._course.move(control[None], force_n=force_n).any():
+                return
 
     def _obstacle(self, place: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.

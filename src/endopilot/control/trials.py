@@ -69,7 +69,7 @@ class Trials:
         wires, count, devices: numbers of wires, of trials, and of devices in a stack.
         fastest: translation (mm/s) and rotation (rad/s) of the wire's drive at most.
         weight: how likely each wire is; one of weight 0 goes along and does not count.
-        still: which trials stand still, whatever they are driven to do.
+        still: which trials stand still, whatever they are driven to do: no time passes for them.
         rows: what they have done, period by period.
     """
 
@@ -196,15 +196,17 @@ class Trials:
         node of the wall with more than a force, N, or fail.
         """
         step = self.drive(self.possible(np.where(self.still[:, None, None], 0.0, control)))
-        return ~self.all(step.valid & (step.contact_force_max <= force_n))
+        return ~self.still & ~self.all(step.valid & (step.contact_force_max <= force_n))
 
     def drive(self, control: Control) -> Step:
-        """Drive for a decision period; return the worlds at its end, with the largest force within it.
+        """Drive those that do not stand still for a decision period; return their worlds at its end, with the largest
+        force within it.
 
         Raises:
             OutOfBudgetError: the search has spent its budget.
         """
-        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)), self._budget)
+        moves = np.tile(~self.still, self.wires)
+        step = drive_period(self.simulator, np.tile(control, (self.wires, 1, 1)), self._budget, worlds=moves)
         self._seen = None
         proximal, tips = self._see()
         self.rows.append(Period(control, proximal, tips[:, WIRE], step.contact_force_max))
@@ -244,14 +246,16 @@ def drive_period(
     simulator: Simulator,
     control: Float[np.ndarray, "worlds *devices 2"],
     budget: Budget | None = None,
+    *,
+    worlds: Bool[np.ndarray, "worlds"] | None = None,
 ) -> Step:
-    """Drive all worlds for a decision period, at a budget; a world that fails stays where it was.
+    """Drive worlds, all if none are chosen, for a decision period, at a budget; one that fails stays where it was.
 
     The worlds at the end of the period are returned, but with the largest `contact_force_max` within it.
     """
     steps = list[Step]()
     for _ in range(_LOOKS):
-        steps.append(simulator.step(control, DECISION_PERIOD_S / _LOOKS))
+        steps.append(simulator.step(control, DECISION_PERIOD_S / _LOOKS, worlds=worlds))
         if budget is not None:
             budget.simulated(simulator, steps[-1])
     return replace(steps[-1], contact_force_max=np.max([step.contact_force_max for step in steps], axis=0))

@@ -99,6 +99,7 @@ def run_core(
             record_attitude=record_attitude,
             threads=config.threads_for(worlds, lanes),
             lanes=lanes,
+            chosen=np.arange(worlds),
             progress=advance,
         )
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}

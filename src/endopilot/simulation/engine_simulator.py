@@ -7,7 +7,7 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -50,11 +50,14 @@ class EngineSimulator(Simulator):
         *,
         shape: bool = False,
         advance: Advance | None = None,
+        worlds: Bool[np.ndarray, "worlds"] | None = None,
     ) -> dict[str, np.ndarray]:
         if not control.shape[1]:
             begun = super()._run(group, control, time_step, steps, shape=shape, advance=advance)
             self._begin(group)
             return begun
+        if worlds is not None:
+            raise InputError("worlds: some are given; the engine 'kirchhoff' drives all, leave them out")
         rows = []
         for velocity in control[:, :, 0].swapaxes(0, 1):
             rows.append(self._driven(group, velocity, time_step * steps))
