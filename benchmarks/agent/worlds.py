@@ -3,7 +3,7 @@
 In every world the agent drives to a target (planned), and a wire is driven at random under the agent's belief, which
 asks for X-ray (random). The targets are those of the seven coronary tasks of the ladder. The patients are new: two sets
 of atlases that neither the ladder nor a training, a calibration or another benchmark has. On `development` an agent may
-be improved; `test` is for what is published. Both are the first four patients of each atlas that
+be improved; `test` is for what is published. Both are the first nine patients of each atlas that
 `benchmarks.agent.ladder_patients.choose` takes, by the ladder's own rules; the atlas of a task has the seed 19000, or
 20000, and the task's level. Beside the shipped worlds, or in their place, some are drawn at random (`drawn_worlds`).
 
@@ -51,26 +51,26 @@ DRAWN = "drawn-{seed}-{number:03d}"
 """Name of a world that is drawn."""
 PATIENTS: dict[Set, dict[str, tuple[int, tuple[int, ...]]]] = {
     "development": {
-        "descending": (19002, (0, 1, 2, 3)),
-        "stenosis": (19003, (5, 14, 15, 23)),
-        "tortuous": (19004, (0, 8, 10, 11)),
-        "crux": (19006, (10, 14, 18, 36)),
-        "diagonal": (19007, (2, 17, 23, 24)),
-        "circumflex": (19008, (0, 1, 2, 5)),
-        "marginal": (19009, (2, 7, 15, 16)),
+        "descending": (19002, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
+        "stenosis": (19003, (5, 14, 15, 23, 26, 27, 28, 35, 38)),
+        "tortuous": (19004, (0, 8, 10, 11, 13, 15, 19, 20, 21)),
+        "crux": (19006, (10, 14, 18, 36, 60, 62, 68, 74, 85)),
+        "diagonal": (19007, (2, 17, 23, 24, 33, 38, 50, 54, 72)),
+        "circumflex": (19008, (0, 1, 2, 5, 7, 9, 13, 14, 15)),
+        "marginal": (19009, (2, 7, 15, 16, 23, 25, 26, 31, 34)),
     },
     "test": {
-        "descending": (20002, (0, 1, 2, 3)),
-        "stenosis": (20003, (7, 10, 18, 23)),
-        "tortuous": (20004, (3, 4, 12, 17)),
-        "crux": (20006, (4, 6, 17, 26)),
-        "diagonal": (20007, (5, 8, 13, 14)),
-        "circumflex": (20008, (3, 4, 8, 9)),
-        "marginal": (20009, (0, 3, 8, 11)),
+        "descending": (20002, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
+        "stenosis": (20003, (7, 10, 18, 23, 32, 33, 35, 37, 44)),
+        "tortuous": (20004, (3, 4, 12, 17, 20, 21, 23, 33, 34)),
+        "crux": (20006, (4, 6, 17, 26, 29, 33, 55, 58, 62)),
+        "diagonal": (20007, (5, 8, 13, 14, 15, 18, 19, 23, 30)),
+        "circumflex": (20008, (3, 4, 8, 9, 10, 13, 15, 17, 18)),
+        "marginal": (20009, (0, 3, 8, 11, 12, 18, 19, 21, 26)),
     },
 }
 """Of each set and task, the seed of the atlas and the numbers of the patients in it."""
-PLACES = 28
+PLACES = 63
 """Patients of a set."""
 SHOWN = 5
 """Exposures after which the ostium is to be known."""
