@@ -92,7 +92,7 @@ def outcome_of(turn: np.ndarray, share: np.ndarray, **differs: np.ndarray) -> Ou
     """Return what became of made-up trials."""
     n, none = len(turn), np.zeros(len(turn))
     motions = Motions(np.full(n, np.nan), none, turn, none, none, np.zeros((n, 1, 2)))
-    made = {"force": none, "to_go": none, "slack": none, "periods": none.astype(int)} | differs
+    made = {"force": none, "to_go": none, "nearest": none, "slack": none, "periods": none.astype(int)} | differs
     return Outcome(motions, np.zeros((1, n, 1, 2)), share=share, farthest=none, halt=["late"] * n, **made)
 
 
@@ -108,6 +108,13 @@ def test_pressing_lagging_slack_and_time_cost(worse) -> None:
     made = outcome_of(np.array([0.0, np.pi]), share, **{worse: np.array([1, 3] if worse == "periods" else [1.0, 3.0])})
     cost = made.cost(1.0)
     assert cost[1] > cost[0]
+
+
+def test_a_trial_that_comes_near_and_falls_off_costs_little_on_the_way() -> None:
+    """Where it ends tells what goes on from there, where it came to what is drawn around it."""
+    away, nearest = np.array([30.0, 10.0]), np.array([1.0, 10.0])
+    made = outcome_of(np.array([0.0, np.pi]), np.zeros(2), to_go=away, nearest=nearest)
+    assert np.argmin(made.cost(1.0)) == 1 and np.argmin(made.cost(1.0, on_the_way=True)) == 0
 
 
 def test_a_row_combines_places_leads_and_rotations() -> None:

@@ -168,6 +168,7 @@ class Outcome:
         force: largest wall force on a node of any wire that counts, N.
         farthest: how far along the route each came, mm.
         to_go: see `Goal.to_go`, mm.
+        nearest: the least that it was on the way, mm.
         slack: how much deeper than it has come each is inserted at its end, mm: what lies in loops.
         halt: why each that did not pass was given up.
     """
@@ -179,6 +180,7 @@ class Outcome:
     force: Each
     farthest: Each
     to_go: Each
+    nearest: Each
     slack: Each
     halt: list[Halt]
 
@@ -191,14 +193,18 @@ class Outcome:
         """How far each trial has to go, and what its slack adds, mm."""
         return self.to_go + _SLACK * np.maximum(self.slack, 0.0)
 
-    def cost(self, force_limit_n: float) -> Each:
+    def cost(self, force_limit_n: float, *, on_the_way: bool = False) -> Each:
         """Return what each trial costs, mm.
 
         That is the share of the wires that it leaves before the place, how far these have to go, the square of its
         largest force as a share of a limit (N), its slack, and its time.
+
+        Args:
+            on_the_way: count how far they had to go where they were nearest, not where they ended: what is drawn
+                around a trial that fell off a branch's mouth may enter it.
         """
         return (
-            (1.0 - self.share) * (_MISS_MM + self.to_go)
+            (1.0 - self.share) * (_MISS_MM + (self.nearest if on_the_way else self.to_go))
             + _FORCE_MM * (self.force / force_limit_n) ** 2
             + _SLACK * np.maximum(self.slack, 0.0)
             + _MM_S * DECISION_PERIOD_S * self.periods
@@ -234,6 +240,7 @@ class Driver:
         took, passed = np.full(trials.count, begun), np.zeros(trials.count, dtype=bool)
         been = np.zeros(trials.simulator.worlds, dtype=bool)
         farthest, inserted_there = trials.progress(goal.route), trials.deepest
+        nearest = goal.to_go(trials, self._config.behind_mm)
         end = begun + min(periods, goal.periods(float(farthest.min()), self._config))
         while len(trials.rows) < end:
             control = self._control()
@@ -250,6 +257,7 @@ class Driver:
             ahead = pushing | (self._alone & (control[:, WIRE, 0] > 0))
             inserted_there = np.where((progress > farthest + REST_MM) | ~ahead, inserted, inserted_there)
             farthest = np.where(ahead, np.maximum(farthest, progress), progress)
+            nearest = np.minimum(nearest, goal.to_go(trials, self._config.behind_mm))
             been = goal.passed(trials) | (been & goal.last)
             self._stop(pushing & _slips(trials, before) & self._alone, "slipped")
             ends = pushing & (self._alone | np.isnan(self._motions.follow_mm))  # others pass once they rest
@@ -271,6 +279,7 @@ class Driver:
             force=_largest_force(trials, took),
             farthest=farthest,
             to_go=goal.to_go(trials, self._config.behind_mm),
+            nearest=nearest,
             slack=trials.deepest - trials.progress(goal.route),
             halt=self._halt.tolist(),
         )

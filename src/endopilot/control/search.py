@@ -203,7 +203,7 @@ class Search:
                 min(periods, self._left - len(trials.rows))
             )
             yield outcome
-            cost = outcome.cost(limit_n)
+            cost = outcome.cost(limit_n, on_the_way=not row.onward)
             if row.onward:
                 trials.copy_trials(np.resize(np.argsort(cost)[:_KEEP], trials.count))
                 best = motions
