@@ -34,9 +34,14 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _STATE_FORMAT = 4  # of `SimulatorState`: raised when its values come to mean something else
 _PACK = 8  # worlds that count as stepped together, however many the processor steps: a budget buys the same on each
-_ALONE = 4  # as many count where one is stepped alone, in a scalar lane
+_FEW = 4  # as many count where no more are stepped; a lane of one alone takes almost as long
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 _AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds; the main thread's long runs are left to Ctrl-C, though
+
+
+def _lanes(worlds: int) -> int:
+    """Return how many worlds are stepped side by side where so many are; the bits are the same."""
+    return LANES if worlds > _FEW else min(LANES, _FEW) if worlds > 1 else 1
 
 
 class Simulator(Readout):
@@ -289,8 +294,9 @@ class Simulator(Readout):
         spent = 0.0
         for group in self._groups:
             of = step.node_iterations[group.index]
-            pack = _PACK if np.count_nonzero(of) > 1 else _ALONE
-            spent += pack * max(-(-len(of) // pack) * of.mean(), of.max())
+            of = of[of > 0]
+            pack = _PACK if len(of) > _FEW else _FEW
+            spent += pack * max(-(-len(of) // pack) * of.mean(), of.max()) if len(of) else 0.0
         return float(self._devices * spent)
 
     @property
@@ -445,7 +451,7 @@ class Simulator(Readout):
             record_shape=shape,
             record_attitude=False,
             threads=self.config.threads_for(len(group.index), LANES),
-            lanes=LANES if len(chosen) > 1 else 1,  # a fifth faster, and to the same bits
+            lanes=_lanes(len(chosen)),
             chosen=chosen,
         )
         with gpu_errors(self.config.processor):
