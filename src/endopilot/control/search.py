@@ -186,7 +186,7 @@ class Search:
         straight = tried[repertoire.rows[0]]
         farthest = int(np.argmax(straight.farthest))
         if straight.periods[farthest] >= self._left:  # it leads on as far as there is time
-            self._repeat(straight, farthest, pauses=True)
+            self._repeat(straight, farthest)
         return halt
 
     def _drive(self, row: Row, goal: Goal) -> Iterator[Outcome]:
@@ -220,15 +220,11 @@ class Search:
         passes = gentle & (outcome.share >= agree - ROUNDING)
         cost = outcome.expected_cost(limit_n)
         for trial in np.flatnonzero(passes)[np.argsort(cost[passes])][:_REPEATED].tolist():
-            paused = not outcome.controls_of(trial).any(axis=(1, 2)).all()
-            for pauses in (False, True)[: 1 + paused]:
-                self._repeat(outcome, trial, pauses=pauses, force_n=force_n)
-                there, done = goal.passed(course) * course.weight, course.rows[len(self._kept.rows) :]
-                pressed = max((float(period.force[course.counted].max()) for period in done), default=0.0)
-                enough = there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING)
-                if enough and pressed <= force_n:
-                    course.weight = there / there.sum()
-                    return True
+            gentle_still = self._repeat(outcome, trial, force_n=force_n)
+            there = goal.passed(course) * course.weight
+            if gentle_still and there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING):
+                course.weight = there / there.sum()
+                return True
         course.restore(self._kept)
         if row.draws is None or not gentle.any():
             return False
@@ -236,18 +232,15 @@ class Search:
         left = np.where(gentle, outcome.left_mm, np.inf)
         if left.min() > start - row.draws.step_mm:
             return False
-        self._repeat(outcome, int(np.argmin(left)), pauses=True, most=row.draws.kept)
+        self._repeat(outcome, int(np.argmin(left)), most=row.draws.kept)
         return True
 
-    def _repeat(
-        self, outcome: Outcome, trial: int, *, pauses: bool, most: int | None = None, force_n: float = np.inf
-    ) -> None:
-        """Let the course do what a trial did, with or without the periods in which nothing moves, until a wire that
-        counts presses with more than a force, N."""
+    def _repeat(self, outcome: Outcome, trial: int, *, most: int | None = None, force_n: float = np.inf) -> bool:
+        """Let the course do what a trial did, less the periods in which it stood still, until a wire that counts
+        presses with more than a force, N; return whether none does."""
         self._course.restore(self._kept)
-        for control in outcome.controls_of(trial)[:most]:
-            if (pauses or control.any()) and self._course.move(control[None], force_n=force_n).any():
-                return
+        moved = (each for each in outcome.controls_of(trial)[:most] if each.any())
+        return not any(self._course.move(control[None], force_n=force_n).any() for control in moved)
 
     def _obstacle(self, place: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
