@@ -63,7 +63,7 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, pair, devic
 
 
 def test_a_plan_says_that_it_breaks_the_force_limit(vessel, tmp_path):
-    made = plan(vessel, "0,0,33", config=PlanConfig(method="forward", force_limit_n=1e-6))
+    made = plan(vessel, "0,0,33", config=PlanConfig(method="inverse", force_limit_n=1e-6))
     assert write_plan(made, output=tmp_path / "pushed")["within_force_limit"] is False
     assert read_json(tmp_path / "pushed" / "manifest.json")["within_force_limit"] is False
 
@@ -153,7 +153,7 @@ def test_planned_controls_are_finite_and_within_limits_whatever_a_model_asks(wil
 @pytest.mark.parametrize(
     ("change", "others", "line"),
     [
-        ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
+        ({"config": replace(CONFIG, method="inverse")}, {}, "method: inverse; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
         ({}, {"model": "a-run"}, "--model a-run: models are of a wire alone"),
         ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),

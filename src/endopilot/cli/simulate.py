@@ -29,7 +29,8 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 @settings
 class RandomConfig:
-    """The random navigations that are simulated if no controls are given."""
+    """The random navigations that are simulated if no controls are given: a tip stops 5 mm before the end of its
+    branch, where the image ends and not the vessel, and a caught wire is pulled back."""
 
     sequences: Annotated[int, Within(1, 100000)] = 8
     """Number of navigations."""
@@ -37,9 +38,6 @@ class RandomConfig:
     """Length of a navigation, s."""
     seed: Seed = 0
     """Seed of the random controls."""
-    stop_short: bool = True
-    """Stop a tip 5 mm before the end of its branch, where the image ends and not the vessel, and pull a caught wire
-    back, as `endopilot dataset` does. Given controls are made as they are."""
 
 
 def simulate_command(
@@ -88,18 +86,13 @@ def simulate_command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-        if random.stop_short:
-            worlds, samples = control.shape[:2]
-            frictions = stack.frictions(np.full(worlds, stack.wire.friction))
-            set_up = SimulationSetUp(
-                [patient] * worlds, [stack] * worlds, initial, frictions, "velocity", moves, config
+        worlds, samples = control.shape[:2]
+        frictions = stack.frictions(np.full(worlds, stack.wire.friction))
+        set_up = SimulationSetUp([patient] * worlds, [stack] * worlds, initial, frictions, "velocity", moves, config)
+        with progress("Simulating the wire", total=worlds * samples) as advance:
+            trajectory, stopped = simulate_navigations(
+                set_up, control, record_shape=also["record_shape"], advance=advance
             )
-            with progress("Simulating the wire", total=worlds * samples) as advance:
-                trajectory, stopped = simulate_navigations(
-                    set_up, control, record_shape=also["record_shape"], advance=advance
-                )
-        else:
-            trajectory = simulate(patient, stack, control, initial=initial, config=config, **also)
     elif controls.is_dir() or controls.suffix.lower() == ".npz":
         recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
         patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]

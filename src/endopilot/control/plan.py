@@ -18,12 +18,10 @@ from endopilot.control.plan_config import Plan, PlanConfig, Steps
 from endopilot.control.set_up import choose_tip
 from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.robot import IDEAL, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import WINDOW, WIRES, read_run
-from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
 from endopilot.settings import from_record, public
 from endopilot.simulation.config import SimulatorConfig
@@ -113,9 +111,7 @@ def _find(
     """Return controls, and the tips that whatever found them predicts, mm."""
     if config.method == "inverse" and run is not None and desired is not None:
         return _by_networks(navigation, run, desired)
-    if config.method in ("inverse", "search") and desired is not None:
-        return _track(navigation, desired)
-    return _search(navigation, config, trial) if config.method == "search" else _by_policy(navigation, config)
+    return _search(navigation, config, trial) if desired is None else _track(navigation, desired)
 
 
 def _check_for_stack(config: PlanConfig, target: str, run: Path | None) -> None:
@@ -246,17 +242,6 @@ def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
         config=SimulatorConfig(threads=1),
     )
     return control[0], tip[0]
-
-
-def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
-    """Let a policy drive the rod core with an ideal drive, and record what it did."""
-    from endopilot.navigation.policies import make_policy
-
-    ideal = LoopConfig(robot=read_robot(IDEAL))
-    record = NavigationLoop(navigation, make_policy(config.method), config=ideal, seed=config.seed).run()
-    proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
-    control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
-    return control, np.column_stack([tip.abscissa, tip.offset])[1:]
 
 
 def _driven(navigation: Navigation, control: Controls, predicted: Steps, desired: Steps | None) -> Trajectory:

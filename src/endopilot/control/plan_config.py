@@ -23,9 +23,9 @@ Steps = Float[np.ndarray, "samples 2"]
 class PlanConfig(GivenConfig):
     """Method and limits of a plan."""
 
-    method: Literal["search", "inverse", "forward", "spin", "retract-rotate"] = "search"
-    """How the controls are found: search (searched in the rod core), inverse (led along desired tips: by the inverse
-    network of --model, or else by a simulated wire), or a baseline: forward, spin, retract-rotate."""
+    method: Literal["search", "inverse"] = "search"
+    """How the controls are found: search (searched in the rod core), or inverse (led along desired tips: by the inverse
+    network of --model, or else by a simulated wire)."""
     speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
     """Speed of the desired tip along the route, and of a straight push, mm/s."""
 
