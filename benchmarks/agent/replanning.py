@@ -13,15 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from endopilot.control.agent import AgentPolicy
-from endopilot.ladder.ladder import CASES, world_of
 from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Observation
 from endopilot.settings import Count
+from endopilot.simulation.world import NOMINAL, World, read_world
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 
 TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")
-MISMATCH = 0.2
 
 
 class AlwaysReplanning(AgentPolicy):
@@ -37,33 +36,33 @@ RULES: dict[str, type[AgentPolicy]] = {"where off course": AgentPolicy, "at ever
 COLUMNS = ("safe success", "exposures", "time, s", "plans", "processor, s")
 
 
-def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[float]:
+def drive(name: str, place: int, world: World, rule: type[AgentPolicy]) -> list[float]:
     """Return the figures of one navigation, as `COLUMNS` names them."""
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
-    world = world_of(case, MISMATCH, navigation, task, place)
     config, began = LoopConfig(simulator=replace(CORE, threads=1)), time.process_time()
     record = NavigationLoop(navigation, policy, config=config, seed=100 * task.level + place, world=world).run()
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 
 
-def compare_replanning(tasks: tuple[str, ...] = TASKS, /, *, case: str = CASES[0], patients: Count = 6) -> None:
+def compare_replanning(tasks: tuple[str, ...] = TASKS, /, *, world: str = NOMINAL, patients: Count = 6) -> None:
     """Drive the ladder's agent by two rules for replanning, and print a table of each task and of all together.
 
     Args:
         tasks: of the ladder.
-        case: of model mismatch, one of `endopilot.ladder.ladder.CASES`.
+        world: its name or a YAML file.
         patients: of each task.
     """
     found: dict[tuple[str, str], list[list[float]]] = {}
+    reality = read_world(world)
     print("| task | replans | " + " | ".join(COLUMNS) + " |\n|---|---|" + "---|" * len(COLUMNS))
     for task in (*tasks, "all"):
         for rule, policy in RULES.items():
             if task == "all":
                 rows = [row for name in tasks for row in found[name, rule]]
             else:
-                rows = found[task, rule] = [drive(task, place, case, policy) for place in range(patients)]
+                rows = found[task, rule] = [drive(task, place, reality, policy) for place in range(patients)]
             safe, *means = np.mean(rows, axis=0)
             cells = [f"{round(safe * len(rows))} of {len(rows)}", *(f"{mean:.1f}" for mean in means)]
             print(f"| {task} | {rule} | " + " | ".join(cells) + " |", flush=True)

@@ -1,10 +1,9 @@
-"""Write tasks and scores into docs/evidence/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH [STEVE]]]`.
+"""Write tasks and scores into docs/evidence/ladder.md: `python docs/figures/ladder.py [FOLDER [STEVE]]`.
 
 FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy in the newest version and, with
-`--version coaxial`, of those that drive a catheter. MISMATCH, runs/ladder-mismatch if not given, holds what it made
-with `--mismatch 0.2`. STEVE, runs/steve if not given, holds what it made of the tasks of a public benchmark, a folder
-for each; what it tells of DualDeviceNav's arteries is read where its tasks lie. A folder that is not there leaves its
-table as it is.
+`--version coaxial`, of those that drive a catheter. STEVE, runs/steve if not given, holds what it made of the tasks of
+a public benchmark, a folder for each; what it tells of DualDeviceNav's arteries is read where its tasks lie. A folder
+that is not there leaves its table as it is.
 """
 
 from __future__ import annotations
@@ -100,26 +99,6 @@ def _rows(mark: str) -> list[tuple[str, ...]]:
     return [row for row in rows if set(row[0]) != {"-"}]
 
 
-def title_of(case: str, share: float) -> str:
-    """Return a case of model mismatch in words."""
-    name, _, side = case.partition("-")
-    sign = {"more": " +", "less": " −"}.get(side, ", ±")
-    return case if case == "matched" else f"{name}{sign}{100 * share:g} %"
-
-
-def mismatch(folder: Path) -> list[str]:
-    """Return a table of scores under model mismatch: safe success, in brackets success, %, and exposures."""
-    done = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/mismatch.json"))]
-    names = [name for content in done for name in (f"`{content['policy']}`, safe success", "exposures")]
-    lines = []
-    for rows in zip(*(content["cases"] for content in done), strict=True):
-        cells = [title_of(rows[0]["case"], done[0]["mismatch"])]
-        for row in rows:
-            cells += [f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})", f"{row['exposures']:g}"]
-        lines.append(cells)
-    return markdown_table(("mismatch", *names), lines)
-
-
 def benchmark(folder: Path) -> list[str]:
     """Return the table of a public benchmark's tasks: what its paper reports, and what each run in a folder reached.
 
@@ -165,16 +144,13 @@ def arteries(results: Path, version: LadderVersion) -> list[str]:
 def main() -> None:
     """Fill the page."""
     given = [Path(argument) for argument in sys.argv[1:]]
-    names = ("ladder", "ladder-mismatch", "steve")
-    ladder, mismatched, steve = [*given, *[ROOT / "runs" / name for name in names][len(given) :]]
+    ladder, steve = [*given, *[ROOT / "runs" / name for name in ("ladder", "steve")][len(given) :]]
     fill(PAGE, "tasks", tasks(), dated=False)
     fill(PAGE, "coaxial tasks", coaxial_tasks(), dated=False)
     driven = {json.loads(path.read_text(encoding="utf-8"))["ladder"] for path in ladder.glob("*/ladder.json")}
     for version, mark in ((NEWEST, "scores"), ("coaxial", "coaxial scores")):
         if version in driven:
             fill(PAGE, mark, scores(ladder, version, mark))
-    if mismatched.is_dir():
-        fill(PAGE, "mismatch", mismatch(mismatched))
     if steve.is_dir():
         fill(PAGE, "benchmark", benchmark(steve))
     for results in sorted(steve.glob("*/dualdevicenav")):

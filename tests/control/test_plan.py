@@ -153,7 +153,11 @@ def test_planned_controls_are_finite_and_within_limits_whatever_a_model_asks(wil
 @pytest.mark.parametrize(
     ("change", "others", "line"),
     [
-        ({"config": replace(CONFIG, method="inverse")}, {}, "method: inverse; a wire in a catheter is planned by search"),
+        (
+            {"config": replace(CONFIG, method="inverse")},
+            {},
+            "method: inverse; a wire in a catheter is planned",
+        ),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
         ({}, {"model": "a-run"}, "--model a-run: models are of a wire alone"),
         ({}, {"device": Stack.of("workhorse-014", CATHETER, "straight-5f")}, "catheter: 2; the search drives one"),

@@ -136,8 +136,8 @@ def test_what_does_not_fit_is_told_in_one_line_and_is_not_there(words, mask, pat
 
 
 ROOT = Path(__file__).parents[2]
-LADDER = {"runs/ladder", "runs/ladder-mismatch"}
-"""Where `endopilot ladder` keeps its results, and where with a model mismatch."""
+LADDER = {"runs/ladder"}
+"""Where `endopilot ladder` keeps its results."""
 
 
 def test_no_two_commands_keep_their_results_in_one_folder():

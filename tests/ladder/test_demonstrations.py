@@ -14,7 +14,6 @@ import pyarrow.dataset
 import pytest
 from PIL import Image
 
-from command import refused
 from endopilot.ladder.attempt import Recording, begun
 from endopilot.ladder.demonstrations import PIXELS, write_demonstrations
 from endopilot.ladder.ladder import LadderConfig, climb
@@ -146,7 +145,3 @@ def test_minari_s_layout_holds_what_an_environment_would_have_observed(made, tmp
         assert [end.sum() for end in ends] == [entry["reason"] == "reached", entry["reason"] == "time"]
         to_go = read["observations"][:-1, 11] * 100  # path length to the target at the last exposure
         assert to_go[0] > 15 and to_go[-1] < to_go[0] - 5
-
-
-def test_mismatch_and_a_dataset_exclude_each_other(tmp_path, capsys):
-    assert "leave one of them out" in refused(capsys, "ladder", "--mismatch", "0.2", "--dataset", tmp_path)

@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.cli.arguments import Answer
-from endopilot.errors import InputError
 from endopilot.extras import extras_present, require_extras
-from endopilot.ladder.ladder import MISMATCH_FILE, LadderConfig, climb, measure_mismatch
+from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.runs import Existing, OutputFolder
 
 
 def ladder_command(
     *,
     output: OutputFolder | None = None,
-    mismatch: float = 0.0,
     check: Existing | None = None,
     dataset: Path | None = None,
     table: bool = False,
@@ -29,10 +27,7 @@ def ladder_command(
     need to confirm the scores without the policy.
 
     Args:
-        output: folder of the results; runs/ladder/POLICY if not given, or runs/ladder-mismatch/POLICY with --mismatch.
-        mismatch: model mismatch, a share between 0 and 1 such as 0.2: friction, tip stiffness, latency and ostium
-            differ by it from what the policy is given, one after another and together. The scores of each case are
-            printed instead of the ladder's.
+        output: folder of the results; runs/ladder/POLICY if not given.
         check: a submission.json. Its recorded controls are driven again, a shipped policy, or that of --policy, also
             decides again, and what that gives is printed; exit code 1 if anything differs from the file, or cannot be
             judged here. No policy climbs then.
@@ -43,8 +38,6 @@ def ladder_command(
             that decisions took; then which tasks a policy has no row of.
         page: write index.html with pictures and replays; --no-page leaves it out.
     """
-    if dataset is not None and mismatch:
-        raise InputError("dataset: with --mismatch, which writes no submission; leave one of them out")
     if table:
         return _tabulated(output)
     if check is not None:
@@ -54,15 +47,11 @@ def ladder_command(
     from endopilot.ladder.submission import SUBMISSION_FILE
     from endopilot.ladder.table import CLIMBED, shown_row
 
-    name = config.policy.replace(":", ".")
-    folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
-    rows = measure_mismatch(folder, config, mismatch) if mismatch else climb(output=folder, config=config)
+    folder = output or Path("runs") / "ladder" / config.policy.replace(":", ".")
+    rows = climb(output=folder, config=config)
     if dataset is not None:
         _write_dataset(folder / SUBMISSION_FILE, dataset)
-    if mismatch:
-        made = {"scores": folder / MISMATCH_FILE}
-    else:
-        made = (_page(folder) if page else {}) | {"submission": folder / SUBMISSION_FILE}
+    made = (_page(folder) if page else {}) | {"submission": folder / SUBMISSION_FILE}
     return Answer(rows, [[shown_row(row, CLIMBED) for row in rows], made])
 
 

@@ -1,29 +1,24 @@
-"""The ladder: twelve tasks, each in twenty patients, or tasks of one's own, that a policy climbs (`climb`), also where
-reality differs from what it is given (`measure_mismatch`)."""
+"""The ladder: twelve tasks, each in twenty patients, or tasks of one's own, that a policy climbs (`climb`)."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import BeforeValidator, model_validator
 
 from endopilot.devices.robot import ASSUMED, read_robot
-from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
-from endopilot.ladder.scores import score, score_navigations
+from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, write_submission
 from endopilot.ladder.terms import Terms
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Text, Within, settings
-from endopilot.simulation.world import NOMINAL, QUANTITIES, World, differing, drawn_sides, read_world
-from endopilot.tasks.navigation import Navigation
+from endopilot.simulation.world import NOMINAL, read_world
 from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
@@ -137,54 +132,3 @@ def drive_one(path: Path, *, policy: str, terms: Terms) -> None:
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), terms=terms)
     write_json(path, {"task": task.name, **terms.about(), "patient": navigation.anatomy.name} | result)
-
-
-MISMATCH_FILE = "mismatch.json"
-CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less", "more")), "all")
-"""No quantity differs; one does; all do, each to a side that is drawn for the patient."""
-
-
-def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[dict[str, Any]]:
-    """Let a policy do tasks of the ladder under model mismatch, and score it in each case.
-
-    Each of `QUANTITIES` differs by `share`, up and down, between 0 and 1; files and errors are those of `climb`, one
-    folder a case. A row for each of `CASES` is returned, and stands in `output`/mismatch.json: over all navigations
-    what `score_navigations` gives.
-    """
-    if not 0 < share < 1:
-        raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
-    if config.world != NOMINAL or config.drawn:
-        raise InputError(f"world: {config.world}; mismatch makes worlds of its own and draws none: leave both out")
-    make_policy(config.policy)
-    tasks = config.chosen
-    terms = terms_of(config)
-    claim(output, "endopilot ladder --mismatch", **terms.identity(config.policy), mismatch=share)
-    paths = {case: config.paths(output / case) for case in CASES}
-    every = [path for of_case in paths.values() for path in of_case]
-    navigate = partial(_drive_one, policy=config.policy, terms=terms, share=share)
-    make_missing(f"Model mismatch, {config.policy}", every, navigate)
-    rows = []
-    for case, of_case in paths.items():
-        results = [read_json(path) for path in of_case]
-        rows.append({"case": case, "navigations": len(results)} | score_navigations(results))
-    content = {"policy": config.policy, "ladder": config.version, "robot": config.robot, "mismatch": share}
-    content |= {"tasks": [task.name for task in tasks], "patients": config.patients_done, "cases": rows}
-    write_json(output / MISMATCH_FILE, content)
-    return rows
-
-
-def world_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> World:
-    """Return what reality is in one case and one patient."""
-    change = {}
-    if case == "all":
-        change = drawn_sides(share, np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]))
-    elif case != "matched":
-        name, side = case.split("-")
-        change = {name: share if side == "more" else -share}
-    return differing(change, navigation.anatomy, World())
-
-
-def _drive_one(path: Path, *, policy: str, terms: Terms, share: float) -> None:
-    task, place = terms.task(path.parent.name), int(path.stem)
-    world = world_of(path.parents[1].name, share, task.ladder_navigation(place), task, place)
-    drive_one(path, policy=policy, terms=replace(terms, world=world))
