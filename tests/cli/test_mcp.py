@@ -46,7 +46,7 @@ def test_ten_tools_have_typed_answers(folder) -> None:
     (rows,) = devices.structured_content.values()
     assert {"workhorse-014"} < {row["name"] for row in rows}
     ((row,),) = vessels.structured_content.values()
-    assert (folder / "drawn" / row["patient"] / "anatomy.json").exists()
+    assert row["patient"].startswith("drawn/") and (folder / row["patient"] / "anatomy.json").exists()
 
 
 def test_an_assistant_plans_and_simulates_over_standard_streams(folder) -> None:
@@ -85,7 +85,9 @@ def test_what_may_be_several_is_a_list(folder) -> None:
         ("replay", {"log": "/etc/passwd", "anatomy": "patient", "output": "r"}, "leads out of the folder"),
         ("plan", {"anatomy": "patient", "target": "vessel", "output": "../p"}, "leads out of the folder"),
         ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "device": "/etc/passwd"}, "leads out"),
-        ("plan", {"anatomy": "patient", "target": "LAD", "output": "p"}, "the vessel has no such section"),
+        ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "catheter": ["/etc/passwd"]}, "leads out"),
+        ("plan", {"anatomy": "patient", "target": 4, "output": "p"}, "'4'; the vessel has no such section"),
+        ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "force": 1}, "force"),
         ("navigate", {"anatomy": "patient", "target": "vessel", "output": "p", "policy": "os:system"}, "choose from"),
         ("segment", {"volume": "none.nii.gz", "output": "m.nii.gz", "method": "os:system"}, "choose from"),
     ],

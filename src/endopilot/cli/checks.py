@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from endopilot.cli.arguments import Answer
-from endopilot.devices.catheter import catheter_yaml, list_catheters
+from endopilot.devices.catheter import catheter_yaml, list_catheters, read_catheter
 from endopilot.devices.device import read_wire
-from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_wires, user_devices
+from endopilot.devices.device_files import device_file, device_yaml, list_wires, user_devices
 from endopilot.errors import InputError
 from endopilot.simulation.tip_load import tip_load_row
 from endopilot.verification import free_rod
@@ -27,13 +27,13 @@ def verify_command() -> Answer:
 
 
 def devices_command(devices: tuple[str, ...] = (), /, *, tip_load: bool = False, yaml: bool = False) -> Answer | None:
-    """List devices: diameter, bending stiffness EI and torsional stiffness GJ at tip and shaft, tip load, tip shape.
+    """List guidewires and catheters: diameters, bending and torsional stiffness EI and GJ, tip load, tip shape.
 
     A device is shipped, or a YAML file in ~/.config/endopilot/devices or in the folder that ENDOPILOT_DEVICES names; it
     is called by its file's name.
 
     Args:
-        devices: names of devices or paths of YAML files; all known devices by default.
+        devices: names of devices or paths of wires' YAML files; all known devices by default.
         tip_load: simulate the tip-load test instead; exit code 1 if a device's error exceeds the bar. π²EI/4L² is its
             load where EI is constant over the first 10 mm.
         yaml: print the file of one device or catheter instead, to start one of your own from.
@@ -43,10 +43,10 @@ def devices_command(devices: tuple[str, ...] = (), /, *, tip_load: bool = False,
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
         print(_yaml(devices[0]), end="")
         return None
-    names = devices or (*list_wires(), *user_devices())
+    names = devices or (*list_wires(), *user_devices(), *(() if tip_load else list_catheters()))
     rows = [tip_load_row(read_wire(name)) if tip_load else _row(name) for name in names]
-    shown = [{name: value for name, value in row.items() if tip_load or name != "tip_load_gf"} for row in rows]
-    return Answer(rows, [shown], passed=all(row.get("passed") is not False for row in rows))
+    tables = ([row for row in rows if ("inner_diameter_mm" in row) is bored] for bored in (False, True))
+    return Answer(rows, list(filter(None, tables)), passed=all(row.get("passed") is not False for row in rows))
 
 
 def _yaml(name: str) -> str:
@@ -57,5 +57,6 @@ def _yaml(name: str) -> str:
 
 
 def _row(name: str) -> dict[str, Any]:
-    path = device_file(name)
-    return read_wire(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}
+    if name in list_catheters():
+        return read_catheter(name).summary()
+    return read_wire(name).summary() | {"origin": "endopilot" if name in list_wires() else str(device_file(name))}

@@ -8,19 +8,20 @@ from __future__ import annotations
 import contextlib
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import reduce
 from operator import or_
 from pathlib import Path
 from types import GenericAlias
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from typing_extensions import TypedDict
 
 from endopilot import __version__
 from endopilot.cli.arguments import Answer
 from endopilot.cli.options import Option
+from endopilot.devices.catheter import list_catheters
 from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 from endopilot.imaging.segment import METHODS
@@ -33,6 +34,7 @@ _ABOUT = (
     "navigate; simulate, xray; replay and calibrate take a robot's logs. For research; no medical device."
 )
 _POINT, _FORCE = list[float], dict[str, Any](reached=bool, within_force_limit=bool, seconds=float, peak_force_n=float)
+_SOME = dict.fromkeys(("tip_bend_deg", "inner_diameter_mm"), float | None)  # of wires or catheters alone
 _FEW = {"lumen_ml": float, "ostium_lps_mm": _POINT | None, "warnings": list[str]}
 TOOLS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "segment": ("volume output vessel method", {"mask": str} | _FEW),
@@ -41,14 +43,14 @@ TOOLS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"anatomy": str, "sections": list[str], "longest_path_mm": float, "ostium_lps_mm": _POINT, "notes": list[str]},
     ),
     "atlas": ("output vessel count seed", {"patient": str, "branches": int, "length_mm": float}),
-    "devices": ("", {"name": str, "diameter_mm": float, "tip_bend_deg": float, "friction": float}),
-    "plan": ("anatomy target output device", {"plan": str, "tip_error_mm": float} | _FORCE),
+    "devices": ("", {"name": str, "diameter_mm": float, "friction": float} | _SOME),
+    "plan": ("anatomy target output device catheter", {"plan": str, "tip_error_mm": float} | _FORCE),
     "navigate": (
-        "anatomy target output device policy seed",
+        "anatomy target output device catheter policy seed",
         {"outcome": str, "exposures": int, "page": str | None} | _FORCE,
     ),
     "simulate": (
-        "anatomy output controls device",
+        "anatomy output controls device catheter",
         {"rollout": str, "samples": int, "deepest_tip_mm": float | None, "largest_wall_force_n": float | None},
     ),
     "xray": (
@@ -83,15 +85,14 @@ def server(folder: Path) -> Any:
         raise InputError(f"{folder}: is no folder; give the one whose files the tools may read and write")
     from mcp.server import MCPServer  # pyright: ignore[reportMissingImports]
 
-    made = MCPServer("endopilot", version=__version__, instructions=_ABOUT)
-    for name in TOOLS:
-        made.add_tool(_tool(folder.resolve(), name), name=name)
-    return made
+    tools = [_tool(folder.resolve(), name) for name in TOOLS]
+    return MCPServer("endopilot", version=__version__, instructions=_ABOUT, tools=tools)
 
 
-def _tool(folder: Path, name: str) -> Callable[..., Any]:
-    """Return a tool as a function: it answers bad input in one line and prints nothing into the protocol."""
+def _tool(folder: Path, name: str) -> Any:
+    """Return a tool: it refuses arguments that it does not have, and prints nothing into the protocol."""
     from mcp.server.mcpserver.exceptions import ToolError  # pyright: ignore[reportMissingImports]
+    from mcp.server.mcpserver.tools import Tool  # pyright: ignore[reportMissingImports]
 
     from endopilot.cli import command_of
 
@@ -122,7 +123,11 @@ def _tool(folder: Path, name: str) -> Callable[..., Any]:
     returned = list[kind] if name in _ROWS else kind
     vars(tool)["__signature__"] = inspect.Signature(parameters, return_annotation=returned)
     tool.__name__, tool.__doc__ = name, made.summary
-    return tool
+    served = Tool.from_function(tool)
+    strict = {"model_config": ConfigDict(extra="forbid", coerce_numbers_to_str=True)}  # section 4 is "4"
+    asked = type(f"{name}Arguments", (served.fn_metadata.arg_model,), strict)
+    served.fn_metadata.arg_model, served.parameters = asked, asked.model_json_schema(by_alias=True)
+    return served
 
 
 def _plain(kind: Any) -> Any:
@@ -153,7 +158,8 @@ def _word(folder: Path, option: Option, value: Any) -> str:
     own = {"policy": POLICIES.shipped, "method": METHODS.shipped}.get(option.name)
     if own is not None and value not in own and value != option.value:
         raise InputError(f"{option.name}: {value!r}; choose from {', '.join(own)}")
-    if "Path" in str(option.kind) or (option.name == "device" and value not in list_wires()):
+    shipped = {"device": list_wires(), "catheter": list_catheters()}.get(option.name)
+    if "Path" in str(option.kind) or (shipped is not None and value not in shipped):
         place = (folder / str(value)).resolve()
         if not place.is_relative_to(folder):
             raise InputError(f"{option.name}: {value} leads out of the folder of this server; give a path in it")

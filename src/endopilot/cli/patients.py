@@ -161,7 +161,7 @@ def atlas_command(*, output: OutputFolder, config: AtlasConfig = AtlasConfig()) 
             path = anatomy.tree.longest_path()
             rows.append(
                 {
-                    "patient": anatomy.name,
+                    "patient": output / anatomy.name,
                     "branches": len(anatomy.tree.branches),
                     "length_mm": round(float(path.abscissa[-1]), 1),
                     "ostium_radius_mm": round(float(path.radius[0]), 2),

@@ -64,6 +64,10 @@ class Catheter(Device):
         lengths, angles = (np.array([0.0, *(arc[part] for arc in self.shape)]) for part in (0, 1))
         return np.interp(abscissa_mm, np.cumsum(lengths), np.cumsum(angles))
 
+    def summary(self) -> dict[str, Any]:
+        """Return what a list of devices shows: `Device.summary` and `inner_diameter_mm`."""
+        return Device.summary(self) | {"inner_diameter_mm": self.inner_diameter_mm}
+
 
 @settings
 class _Shape:

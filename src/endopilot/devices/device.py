@@ -129,6 +129,19 @@ class Device:
         """Return GJ in N·mm² at distances from the tip."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
 
+    def summary(self) -> dict[str, Any]:
+        """Return `name`, `diameter_mm`, stiffnesses `ei_tip_n_mm2`, `ei_shaft_n_mm2`, `gj_tip_n_mm2` and
+        `gj_shaft_n_mm2`, and `friction`."""
+        return {
+            "name": self.name,
+            "diameter_mm": self.diameter_mm,
+            "ei_tip_n_mm2": self.bend_stiffness_n_mm2[0],
+            "ei_shaft_n_mm2": self.bend_stiffness_n_mm2[-1],
+            "gj_tip_n_mm2": self.twist_stiffness_n_mm2[0],
+            "gj_shaft_n_mm2": self.twist_stiffness_n_mm2[-1],
+            "friction": self.friction,
+        }
+
 
 @settings
 class Wire(Device):
@@ -178,22 +191,10 @@ class Wire(Device):
         return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of devices shows: `name`, `diameter_mm`, stiffnesses `ei_tip_n_mm2`, `ei_shaft_n_mm2`,
-        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf` (gram-force; None where it
-        states none), `tip_bend_deg` and `friction`."""
-        load = self.tip_load_n
-        return {
-            "name": self.name,
-            "diameter_mm": self.diameter_mm,
-            "ei_tip_n_mm2": self.bend_stiffness_n_mm2[0],
-            "ei_shaft_n_mm2": self.bend_stiffness_n_mm2[-1],
-            "gj_tip_n_mm2": self.twist_stiffness_n_mm2[0],
-            "gj_shaft_n_mm2": self.twist_stiffness_n_mm2[-1],
-            "tip_load_n": load,
-            "tip_load_gf": None if load is None else round(load / GRAM_FORCE_N, 3),
-            "tip_bend_deg": round(float(np.rad2deg(self.tip_bend_rad)), 3),
-            "friction": self.friction,
-        }
+        """Return what a list of devices shows: `Device.summary`, the catalogue's `tip_load_n` (None where it states
+        none) and `tip_bend_deg`."""
+        bend = {"tip_bend_deg": round(float(np.rad2deg(self.tip_bend_rad)), 3)}
+        return Device.summary(self) | {"tip_load_n": self.tip_load_n} | bend
 
 
 @settings

@@ -60,11 +60,6 @@ def there(path: Path) -> bool:
         return False
 
 
-def is_shipped(path: Path) -> bool:
-    """Return whether a device's file comes with the package."""
-    return path.parent == _SHIPPED
-
-
 def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
     """Return the YAML file of a device, as `device_file`, and the text in it; InputError if it is no text."""
     path = device_file(name_or_path)

@@ -84,7 +84,8 @@ def tip_load_row(device: Wire) -> dict[str, Any]:
     error = None if stated is None else load / stated - 1
     shown = device.summary()
     return {
-        **{name: shown[name] for name in ("name", "ei_tip_n_mm2", "tip_load_n", "tip_load_gf")},
+        **{name: shown[name] for name in ("name", "ei_tip_n_mm2", "tip_load_n")},
+        "tip_load_gf": None if stated is None else round(stated / GRAM_FORCE_N, 3),
         "tested_tip_load_n": round(load, 5),
         "tested_tip_load_gf": round(load / GRAM_FORCE_N, 3),
         "error": None if error is None else round(error, 4),
