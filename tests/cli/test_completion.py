@@ -25,7 +25,7 @@ def test_tab_completes(capsys, tmp_path):
         (["endopilot", "na"], "navigate"),
         (["endopilot", "navigate", "patient", "--tar"], "--target"),
         (["endopilot", "xray", "--show", ""], "fluoroscopy contrast dsa roadmap"),
-        (["endopilot", "navigate", "pat"], ""),  # bash goes on with files
+        (["endopilot", "navigate", "patient", "--robot", ""], ""),  # bash goes on with files
     ):
         line = ["bash", "-c", ASK, tmp_path / "script", *words]
         assert subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip() == completed

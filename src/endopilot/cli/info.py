@@ -16,19 +16,19 @@ SCRIPT = """\
 # Tab completes `endopilot`: keep this in a file, and `source` the file from ~/.bashrc or ~/.zshrc.
 [ -n "$ZSH_VERSION" ] && autoload -U +X compinit bashcompinit && compinit && bashcompinit
 _endopilot() {{
-  local words before="${{COMP_WORDS[COMP_CWORD-1]}}"
-  case "${{COMP_WORDS[1]}} $before" in
+  local words word="${{COMP_WORDS[COMP_CWORD]}}"
+  case "${{COMP_WORDS[1]}} ${{COMP_WORDS[COMP_CWORD-1]}} $word" in
 {cases}
   esac
   [ "$COMP_CWORD" = 1 ] && words="{names}"
-  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+  COMPREPLY=($(compgen -W "$words" -- "$word"))
 }}
 complete -o default -F _endopilot endopilot
 """
 
 
 def completion_command(shell: Literal["bash", "zsh", "fish"] = "bash", /) -> None:
-    """Print a script with which a shell completes commands, options and choices; files where none of them fits.
+    """Print a script with which a shell completes commands, choices, and options after a dash; else files.
 
     `endopilot completion > ~/.endopilot-completion`, and `source ~/.endopilot-completion` in ~/.bashrc or ~/.zshrc; or
     `endopilot completion fish > ~/.config/fish/completions/endopilot.fish`.
@@ -42,8 +42,8 @@ def completion_command(shell: Literal["bash", "zsh", "fish"] = "bash", /) -> Non
         choices = {leaf.flags[-1]: leaf.takes[1:].partition("}")[0] for leaf in leaves if leaf.takes[:1] == "{"}
         chosen = {flag: names.replace(",", " ") for flag, names in choices.items()}
         flags = [leaf.flags[-1] for leaf in leaves] + ["--help", "--help-all", "--config"]
-        cases += [f'    "{name} {flag}") words="{choices}";;' for flag, choices in chosen.items()]
-        cases += [f'    "{name} "*) words="{" ".join(flags)}";;']
+        cases += [f'    "{name} {flag} "*) words="{choices}";;' for flag, choices in chosen.items()]
+        cases += [f'    "{name} "*" -"*) words="{" ".join(flags)}";;']
         fish += [f"complete -c endopilot -n __fish_use_subcommand -f -a {name} -d {shlex.quote(summary)}"]
         seen = f"complete -c endopilot -n '__fish_seen_subcommand_from {name}' -l"
         fish += [f"{seen} {flag[2:]} {f'-xa {chosen[flag]!r}' if flag in chosen else ''}" for flag in flags]
