@@ -64,6 +64,12 @@ def writing(path: Path) -> Iterator[Path]:
         partial.replace(path)
 
 
+def write_whole(path: str | Path, content: str | bytes) -> None:
+    """Write a file whole or not at all; InputError as `writing` has it."""
+    with writing(path) as partial:
+        partial.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
 @contextmanager
 def writing_folder(folder: Path, record: str) -> Iterator[Path]:
     """Yield a temporary folder whose files go into `folder` when the block ends without an error, `record` last, by
@@ -147,15 +153,12 @@ def json_text(content: Any, *, indented: bool = True) -> str:
 
 def write_json(path: Path, content: Any, *, indented: bool = True) -> None:
     """Write `content` as JSON, whole or not at all; indented, or in one line where there is much of it."""
-    with writing(path) as partial:
-        partial.write_text(json_text(content, indented=indented) + "\n", encoding="utf-8")
+    write_whole(path, json_text(content, indented=indented) + "\n")
 
 
 def write_yaml(path: Path, content: Any) -> None:
     """Write `content` as YAML in its order, whole or not at all; tuples become lists."""
-    with writing(path) as partial:
-        text = yaml.safe_dump(_lists(content), sort_keys=False, allow_unicode=True)
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, yaml.safe_dump(_lists(content), sort_keys=False, allow_unicode=True))
 
 
 def _lists(content: Any) -> Any:

@@ -41,10 +41,10 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure as the bytes of a PNG file."""
+def png(figure: Figure, *, dpi: float = STYLE["figure.dpi"]) -> bytes:
+    """Return a figure as the bytes of a PNG file, of so many dots an inch."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=STYLE["figure.dpi"])
+    figure.savefig(stream, format="png", dpi=dpi)
     return stream.getvalue()
 
 

@@ -22,9 +22,9 @@ from endopilot.anatomy.distance import sample
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.anatomy.wall_mesh import wall_mesh
-from endopilot.files import writing
+from endopilot.files import write_whole
 from endopilot.lines import places_on
-from endopilot.plotting import plain_text, section_colors
+from endopilot.plotting import plain_text, png, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
 
 SECTIONS = 6  # cross-sections that are drawn, evenly along the longest path
@@ -47,8 +47,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
     half = 2.2 * float(np.quantile(line.radius, 0.95)) + 1.0
     _draw_straightened(anatomy, line, half, volume, middle)
     _draw_sections(anatomy, line, half, volume, bottom)
-    with writing(Path(path)) as partial:
-        figure.savefig(partial, format="png", dpi=90)
+    write_whole(path, png(figure, dpi=90))
     plt.close(figure)
 
 

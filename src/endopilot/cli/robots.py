@@ -15,7 +15,7 @@ from endopilot.devices.catheter import write_device
 from endopilot.devices.device import read_wire
 from endopilot.devices.robot import read_robot
 from endopilot.devices.stack import Stack
-from endopilot.files import input_hash, manifest, write_json, writing
+from endopilot.files import input_hash, manifest, write_json, write_whole
 from endopilot.plotting import png
 from endopilot.robot.calibrate import CalibrateConfig, RobotCalibration, calibrate
 from endopilot.robot.log import read_log
@@ -54,13 +54,10 @@ def replay_command(
     found = replay_log([read], patient, Stack(wire), robot=drives, config=config)
     figures = summary(found)
     title = f"{read.name} beside {device}, robot {Path(robot).name}"
-    with writing(output / "replay.png") as partial:
-        partial.write_bytes(png(replay_figure(patient, found, title)))
-    with writing(output / "replay.csv") as partial:
-        pd.concat([_table(each) for each in found]).to_csv(partial, index=False)
-    with writing(output / "errors.csv") as partial:
-        rows = [{"episode": each.number, **{f"{k}_mm": v for k, v in each.errors.items()}} for each in found]
-        pd.DataFrame(rows).to_csv(partial, index=False)
+    write_whole(output / "replay.png", png(replay_figure(patient, found, title)))
+    write_whole(output / "replay.csv", pd.concat([_table(each) for each in found]).to_csv(index=False))
+    rows = [{"episode": each.number, **{f"{k}_mm": v for k, v in each.errors.items()}} for each in found]
+    write_whole(output / "errors.csv", pd.DataFrame(rows).to_csv(index=False))
     write_json(output / "manifest.json", manifest(config=config, inputs=inputs, figures=figures))
     return figures
 

@@ -22,7 +22,7 @@ from endopilot.cockpit.world import Snapshot, loop_snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
-from endopilot.files import reading, writing
+from endopilot.files import reading, write_whole, writing
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import recorded_navigation
 from endopilot.progress import progress
@@ -212,21 +212,18 @@ def write_film(film: Film, output: Path) -> None:
     """Write wire and catheters of a film as lines, LPS mm, with the wall's force on each node, N: at its end (.vtp, a
     model), or every 0.2 s (.seq.mrb, a sequence). Raises InputError for another suffix, or a film that fails."""
     Place("file", (".seq.mrb", ".vtp")).files(output)
-    whole = output.suffix.lower() != ".vtp"
     with progress("Driving again", 1) as advance:
         shown = [frame.snapshot for frame in film.make()]
         advance()
-    with writing(output) as partial:
-        if not whole:
-            partial.write_text(_as_vtp(shown[-1]), encoding="utf-8")
-            return
-        chosen = shown[::EVERY]
-        times = ";".join(f"vtkMRMLModelNode{number}:{each.time_s:g}" for number, each in enumerate(chosen))
-        models = "\n".join(map(_ONE.format, range(len(chosen))))
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("Wire/Wire.mrml", _ALL.format(models=models, times=times))
-            for number, each in enumerate(chosen):
-                archive.writestr(f"Wire/Data/Wire_{number}.vtp", _as_vtp(each))
+    if output.suffix.lower() == ".vtp":
+        return write_whole(output, _as_vtp(shown[-1]))
+    chosen = shown[::EVERY]
+    times = ";".join(f"vtkMRMLModelNode{number}:{each.time_s:g}" for number, each in enumerate(chosen))
+    models = "\n".join(map(_ONE.format, range(len(chosen))))
+    with writing(output) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("Wire/Wire.mrml", _ALL.format(models=models, times=times))
+        for number, each in enumerate(chosen):
+            archive.writestr(f"Wire/Data/Wire_{number}.vtp", _as_vtp(each))
 
 
 def _as_vtp(shown: Snapshot) -> str:

@@ -30,7 +30,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.robot import RobotConfig
 from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
-from endopilot.files import manifest, read_json, write_json, writing
+from endopilot.files import manifest, read_json, write_json, write_whole
 from endopilot.parallel import CORES
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
@@ -136,8 +136,7 @@ def describe(layout: Layout, blocks: Sequence[Block], work: dict[str, Any]) -> N
     work["processor_seconds"] += time.process_time() - started
     write_json(stats_path, stats)
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([layout.task], name="task"))
-    with writing(tasks_path) as partial:
-        tasks.to_parquet(partial)
+    write_whole(tasks_path, tasks.to_parquet())
     write_json(info_path, schema.info(described, episodes=len(episodes), samples=len(episodes) * config.samples))
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]

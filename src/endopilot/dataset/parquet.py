@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from endopilot.dataset import schema
 from endopilot.errors import InputError
-from endopilot.files import regular, writing
+from endopilot.files import regular, write_whole
 from endopilot.progress import Advance
 from endopilot.simulation.trajectory import Trajectory, trajectory_signals
 
@@ -53,8 +53,7 @@ def write_tables(
     samples_path, episodes_path = schema.paths_of_file(folder, number)
     for path, columns in ((episodes_path, episodes), (samples_path, samples)):
         table = pa.table(dict(columns)).replace_schema_metadata({_KEY: key.encode()})
-        with writing(path) as partial:
-            partial.write_bytes(_parquet_bytes(table))
+        write_whole(path, _parquet_bytes(table))
 
 
 def _parquet_bytes(table: pa.Table) -> bytes:

@@ -14,7 +14,7 @@ from endopilot.dataset import parquet, schema
 from endopilot.devices.stack import column_prefixes, lines_from_tips
 from endopilot.env.exposures import Views
 from endopilot.errors import InputError
-from endopilot.files import manifest, png_image, sha256, write_json, writing
+from endopilot.files import manifest, png_image, sha256, write_json, write_whole
 from endopilot.ladder.attempt import Recording, begun, navigation_seed
 from endopilot.ladder.submission import Submission, read_submission
 from endopilot.progress import progress
@@ -78,8 +78,8 @@ def write_demonstrations(submission: str | Path, *, output: str | Path) -> dict[
         low_to_std = {key: [[value] for value in values] for key, values in stats[name].items() if key != "count"}
         stats[name] |= {key: [value] * _CHANNELS for key, value in low_to_std.items()}
     write_json(output / schema.STATS_PATH, stats)
-    with writing(output / schema.TASKS_PATH) as partial:
-        pd.DataFrame({"task_index": range(len(titles))}, index=pd.Index(titles, name="task")).to_parquet(partial)
+    tasks = pd.DataFrame({"task_index": range(len(titles))}, index=pd.Index(titles, name="task"))
+    write_whole(output / schema.TASKS_PATH, tasks.to_parquet())
     about = schema.info(described, episodes=len(chosen), samples=samples, tasks=len(titles))
     write_json(output / schema.INFO_PATH, about)
     write_json(output / schema.MANIFEST_PATH, manifest(config=None, inputs={path.name: key}, policy=read.policy))

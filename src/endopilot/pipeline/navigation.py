@@ -18,7 +18,7 @@ from endopilot.control.outcome import decision_times, name_target, slipped_s, te
 from endopilot.control.set_up import tip_name
 from endopilot.devices.stack import Stack
 from endopilot.extras import extras_present
-from endopilot.files import manifest, read_json, write_json, writing
+from endopilot.files import manifest, read_json, write_json, write_whole
 from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.simulation.signals import table_columns
 from endopilot.simulation.trajectory import TRAJECTORY
@@ -94,8 +94,7 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
         driven_in = output / ANATOMY_FOLDER
         if not driven_in.exists():
             write_anatomy(real, output=driven_in)
-    with writing(output / TABLE_FILE) as partial:
-        navigation_table(found).to_csv(partial, index=False)
+    write_whole(output / TABLE_FILE, navigation_table(found).to_csv(index=False))
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "world": _world(set_up)}
@@ -118,8 +117,7 @@ def _write_page(found: PatientNavigation, output: Path, commands: Mapping[str, s
     from endopilot.report.navigation_page import navigation_figure, write_navigation_page
 
     picture = png(navigation_figure(found))
-    with writing(output / PICTURE_FILE) as partial:
-        partial.write_bytes(picture)
+    write_whole(output / PICTURE_FILE, picture)
     write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from endopilot.control.plan_picture import draw_route
-from endopilot.files import read_json, writing
+from endopilot.files import read_json, write_whole, writing
 from endopilot.ladder.attempt import begun, navigation_seed
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.ladder.submission import recorded_navigation
@@ -37,8 +37,7 @@ def write_ladder_page(output: Path) -> Path:
     tasks = [terms.task(row["task"]) for row in content["scores"] if row["level"] is not None]
     plotly = output / "plotly.min.js"
     if not plotly.exists():
-        with writing(plotly) as partial:
-            partial.write_text(get_plotlyjs(), encoding="utf-8")
+        write_whole(plotly, get_plotlyjs())
     sections = [_section(output, task, content["patients"]) for task in tasks]
     write_page(
         output / PAGE_FILE,

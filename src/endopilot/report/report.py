@@ -24,7 +24,7 @@ from endopilot.evaluation.results import (
     SplitResult,
     read_results,
 )
-from endopilot.files import json_text, read_json, writing
+from endopilot.files import json_text, read_json, write_whole
 from endopilot.imaging.volume import read_mask, read_volume
 from endopilot.plotting import png
 from endopilot.report import figures, report_text
@@ -91,8 +91,7 @@ def write_page(path: Path, template: str, **content: Any) -> None:
     )
     css = (Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8")
     page = made.get_template(template).render(css=Markup(css), **content)
-    with writing(path) as partial:
-        partial.write_text(page, encoding="utf-8")
+    write_whole(path, page)
 
 
 def _patient(patient: PatientContent) -> dict[str, Any]:
@@ -164,10 +163,8 @@ def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str]
         "control_error": (figures.control_error_table(results), figures.control_error_figure),
     }
     for name, (table, draw) in drawn.items():
-        with writing(folder / f"{name}.csv") as partial:
-            table.to_csv(partial, index=False)
-        with writing(folder / f"{name}.png") as partial:
-            partial.write_bytes(png(draw(table, titles)))
+        write_whole(folder / f"{name}.csv", table.to_csv(index=False))
+        write_whole(folder / f"{name}.png", png(draw(table, titles)))
 
 
 def _write_page(folder: Path, metrics: Mapping[str, Any]) -> Path:

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from endopilot.anatomy.wall_mesh import WallMesh, wall_mesh
 from endopilot.devices.device import Device
-from endopilot.files import png_image, writing
+from endopilot.files import png_image, write_whole
 from endopilot.parallel import Workers
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.types import Anatomy
@@ -38,8 +38,7 @@ def render_still(anatomy: Anatomy, lines: Lines, path: Path, *, devices: Sequenc
             picture = process.submit(render, surface, centerlines, lines, widths).result(TIMEOUT_S)
     except (RuntimeError, TimeoutError):  # one that died is a RuntimeError
         return LIBRARIES_MISSING
-    with writing(Path(path)) as partial:
-        partial.write_bytes(png_image(picture))
+    write_whole(path, png_image(picture))
     return None
 
 

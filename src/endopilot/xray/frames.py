@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.files import writing
+from endopilot.files import write_whole
 from endopilot.runs import CSV
 from endopilot.simulation.csv_file import read_columns
 from endopilot.xray.line_observations import DeviceFrame, Line
@@ -83,5 +83,4 @@ def write_locations(locations: Sequence[TipLocation], *, output: str | Path) -> 
         }
         for one in locations
     ]
-    with writing(Path(output)) as partial:
-        pd.DataFrame(rows).to_csv(partial, index=False, float_format="%.4f")
+    write_whole(output, pd.DataFrame(rows).to_csv(index=False, float_format="%.4f"))

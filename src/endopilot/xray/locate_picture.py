@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Float32
 
-from endopilot.files import writing
-from endopilot.plotting import BLUE, GREY, ORANGE, STYLE, VERMILLION
+from endopilot.files import write_whole
+from endopilot.plotting import BLUE, GREY, ORANGE, STYLE, VERMILLION, png
 from endopilot.types import Anatomy
 from endopilot.xray.tip_filter import TipLocation
 
@@ -64,8 +64,7 @@ def draw_locations(
             )
         if chosen:
             axes[0][0].legend(loc="lower left")
-        with writing(Path(output)) as partial:
-            figure.savefig(partial, format="png", dpi=STYLE["figure.dpi"])
+        write_whole(output, png(figure))
         plt.close(figure)
 
 
@@ -77,5 +76,4 @@ def write_page(output: Path, *, title: str, said: Sequence[str], picture: Path) 
 <h1>{escape(title)}</h1><ul>{"".join(f"<li>{escape(line)}</li>" for line in said)}</ul>
 <img alt="frames with vessel, device and tip" src="data:image/png;base64,{png}"></html>
 """
-    with writing(output) as partial:
-        partial.write_text(page, encoding="utf-8")
+    write_whole(output, page)

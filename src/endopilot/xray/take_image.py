@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from endopilot.devices.stack import Stack, lines_from_tips
-from endopilot.files import png_image, writing
+from endopilot.files import png_image, write_whole
 from endopilot.runs import PNG
 from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, public, settings
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
@@ -89,8 +89,7 @@ class XrayImage:
             InputError: the suffix is not .png, or the file cannot be written.
         """
         PNG.files(Path(path))
-        with writing(Path(path)) as partial:
-            partial.write_bytes(png_image(self.grey))
+        write_whole(path, png_image(self.grey))
 
 
 @public
