@@ -6,7 +6,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
 from endopilot.control.difficulty import NAVIGATIONS_FILE, Shape, arch_type, assess_difficulty, expected
 from endopilot.devices.device import read_wire
 from endopilot.tasks.route import Route
@@ -51,17 +51,14 @@ REAL = (
 )
 """Length, mm, turning, degrees, forks, exposures and seconds of the agent's navigations in real coronary arteries that
 the model has not seen: `python -m benchmarks coronary-navigation PATIENT... --config.world nominal` printed them."""
-
-
-def told_of_real():
-    return [expected(Shape(length, float(turning), forks)) for length, turning, forks, *_ in REAL]
+TOLD = [expected(Shape(length, float(turning), forks)) for length, turning, forks, *_ in REAL]
 
 
 @pytest.mark.parametrize(("measure", "column"), [("exposures", 3), ("seconds", 4)])
 def test_intervals_hold_in_real_arteries(measure, column):
-    told, truth = told_of_real(), np.array([row[column] for row in REAL])
+    truth = np.array([row[column] for row in REAL])
     inside = [
-        each[f"{measure}_from"] <= value <= each[f"{measure}_to"] for each, value in zip(told, truth, strict=True)
+        each[f"{measure}_from"] <= value <= each[f"{measure}_to"] for each, value in zip(TOLD, truth, strict=True)
     ]
     assert np.mean(inside) >= 0.7  # intervals of 80 %
 
@@ -69,8 +66,13 @@ def test_intervals_hold_in_real_arteries(measure, column):
 def test_expected_seconds_in_real_arteries_beat_the_mean_of_the_ladder():
     truth = np.log([row[4] for row in REAL])
     table = np.genfromtxt(str(files("endopilot.control") / NAVIGATIONS_FILE), delimiter=",", names=True, dtype=None)
-    errors = np.abs(truth - np.log([each["seconds"] for each in told_of_real()]))
+    errors = np.abs(truth - np.log([each["seconds"] for each in TOLD]))
     assert errors.mean() < 0.5 * np.abs(truth - np.log(table["seconds"]).mean()).mean()
+
+
+def test_ways_that_are_longer_than_the_ladder_s_are_extrapolated():
+    rows = assess_difficulty(make_patient(AtlasConfig(vessel="arch", seed=5), 0), read_wire("j-035"))
+    assert [row["extrapolated"] for row in rows] == [row["length_mm"] > 241 for row in rows] == [False] * 5 + [True] * 3
 
 
 def test_an_arch_is_of_the_type_that_was_drawn():

@@ -28,8 +28,10 @@ def difficulty_command(anatomy: Existing, /, *, target: tuple[str, ...] = (), de
     """
     patient = read_anatomy(anatomy)
     rows = assess_difficulty(patient, read_wire(device), places=target)
-    kind = arch_type(patient.tree)
-    return Answer(rows, [*([f"aortic arch of type {kind}"] if kind else []), [_shown(row) for row in rows]])
+    said = [f"aortic arch of type {kind}"] if (kind := arch_type(patient.tree)) else []
+    if beyond := ", ".join(row["section"] for row in rows if row["extrapolated"]):
+        said += [f"extrapolated beyond the ladder's navigations: {beyond}"]
+    return Answer(rows, [[_shown(row) for row in rows], *said])
 
 
 def _shown(row: dict[str, float | str | None]) -> dict[str, str]:
@@ -37,7 +39,7 @@ def _shown(row: dict[str, float | str | None]) -> dict[str, str]:
 
     def cell(measure: str) -> str:
         values = [row[f"{measure}{end}"] for end in ("", "_from", "_to")]
-        return "-" if None in values else "{:.0f} ({:.0f} to {:.0f})".format(*values)
+        return "-" if None in values else "{:.0f} ({:.0f}–{:.0f})".format(*values)
 
     forms = {"section": "{}", "length_mm": "{:.0f}", "turning_deg": "{:.0f}", "forks": "{}"}
     forms |= {"bore_mm": "{:.2f}", "tip_reaches": "{:.0%}"}

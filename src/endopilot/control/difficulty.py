@@ -9,7 +9,7 @@ for a kind of vessel that the fit has not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -29,7 +29,7 @@ INTERVAL = (0.1, 0.9)
 """Quantiles between which an interval of 80 % lies."""
 _CHORD_MM = 5.0
 """A direction is that of a chord as long, mm: the turning of a centerline's own noise stays out."""
-_MEASURES = ("exposures", "seconds")
+_SHAPE, _MEASURES = ["length_mm", "turning_deg", "forks"], ("exposures", "seconds")
 _UNTOLD = dict.fromkeys(f"{measure}{end}" for measure in _MEASURES for end in ("", "_from", "_to"))
 
 
@@ -73,7 +73,7 @@ def assess_difficulty(anatomy: Anatomy, wire: Wire, *, places: Sequence[str] = (
         narrowest place is wider than the wire; `tip_reaches`, the largest share of a fork's free width that the tip
         reaches to the side, at the fork where that is least (1: the tip enters from however it lies); `exposures` and
         `seconds` that are expected, each with its interval of 80 % (`_from`, `_to`). What lies behind a place narrower
-        than the wire has none.
+        than the wire has none. `extrapolated`: the route is longer, or has more turns or forks, than all of the ladder.
 
     Raises:
         InputError: nothing is named, or what does not lie in the vessel.
@@ -86,6 +86,7 @@ def assess_difficulty(anatomy: Anatomy, wire: Wire, *, places: Sequence[str] = (
         tip_mm = lateral_reach(wire.tip_bend_rad, wire.tip_bend_length_mm)
         reaches = [tip_mm / fork.width_mm for fork in forks(route, wire) if fork.width_mm > 0]
         row = {"section": place, **asdict(shape), "bore_mm": bore_mm, "tip_reaches": float(min([1.0, *reaches]))}
+        row["extrapolated"] = bool(np.any(np.array(astuple(shape)) > _navigations()[_SHAPE].max()))
         rows.append(row | (expected(shape) if bore_mm > 0 else _UNTOLD))
     return sorted(rows, key=lambda row: row["seconds"] or np.inf)
 
@@ -125,10 +126,15 @@ def _features(shapes: Sequence[Shape]) -> Float[np.ndarray, "n 4"]:
 
 
 @cache
+def _navigations() -> pd.DataFrame:
+    return pd.read_csv(str(files("endopilot.control") / NAVIGATIONS_FILE))
+
+
+@cache
 def _fit(measure: str) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "2"]]:
     """Return the weights of the model of a measure, and the quantiles of its residuals, task by task left out."""
-    table = pd.read_csv(str(files("endopilot.control") / NAVIGATIONS_FILE))
-    features = _features([Shape(*row) for row in table[["length_mm", "turning_deg", "forks"]].itertuples(index=False)])
+    table = _navigations()
+    features = _features([Shape(*row) for row in table[_SHAPE].itertuples(index=False)])
     logs, tasks = np.log(table[measure].to_numpy(dtype=float)), table["task"].to_numpy()
     residuals = []
     for task in np.unique(tasks):
