@@ -149,8 +149,9 @@ def _in_shell(script: str, folder: Path) -> str:
 
 
 def _environment() -> dict[str, str]:
-    """Return an environment in which `endopilot` and `python` are those that run this."""
-    return os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    """Return an environment in which `endopilot` and `python` are those that run this; `SOURCES` is this tree."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return os.environ | {"PATH": path, "SOURCES": str(FOLDER.parents[1])}
 
 
 def key(line: str) -> str:

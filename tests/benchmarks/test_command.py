@@ -16,6 +16,7 @@ from benchmarks.figures import Bar, all_passed
 ROOT = Path(__file__).parents[2]
 SHOWN = re.compile(r"python -m benchmarks ([a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)--[a-z][a-z0-9-]*")
+HELP = "`python -m benchmarks judges --help` lists the options"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "Makefile", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -49,6 +50,7 @@ def test_commands_in_the_docs_exist(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["simulaton"], "benchmarks simulaton: there is none of this name; `python -m benchmarks --help` lists them"),
         (["labels", "--count", "0"], "benchmarks labels: count: 0; give a whole number from 1 to 1000000"),
+        (["anatomy", "--against", "vmtk", "--x"], f"benchmarks judges: unrecognized arguments: --x; {HELP}"),
         (
             ["env", "--against", "nowhere"],
             "benchmarks env: nowhere: has no .venv/bin/python; `make test` makes it",

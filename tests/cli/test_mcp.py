@@ -81,7 +81,6 @@ def test_what_may_be_several_is_a_list(folder) -> None:
     [
         ("xray", {"anatomy": "../secret", "output": "x.png"}, "leads out of the folder"),
         ("xray", {"anatomy": "link", "output": "x.png"}, "leads out of the folder"),
-        ("xray", {"anatomy": "/etc", "output": "x.png"}, "leads out of the folder"),
         ("replay", {"log": "/etc/passwd", "anatomy": "patient", "output": "r"}, "leads out of the folder"),
         ("plan", {"anatomy": "patient", "target": "vessel", "output": "../p"}, "leads out of the folder"),
         ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "device": "/etc/passwd"}, "leads out"),

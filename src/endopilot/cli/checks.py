@@ -41,19 +41,14 @@ def devices_command(devices: tuple[str, ...] = (), /, *, tip_load: bool = False,
     if yaml:
         if len(devices) != 1:
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
-        print(_yaml(devices[0]), end="")
+        (name,) = devices
+        _row(name)  # refuses a damaged file
+        print(catheter_yaml(name) if name in list_catheters() else device_yaml(name)[1], end="")
         return None
     names = devices or (*list_wires(), *user_devices(), *(() if tip_load else list_catheters()))
     rows = [tip_load_row(read_wire(name)) if tip_load else _row(name) for name in names]
     tables = ([row for row in rows if ("inner_diameter_mm" in row) is bored] for bored in (False, True))
     return Answer(rows, list(filter(None, tables)), passed=all(row.get("passed") is not False for row in rows))
-
-
-def _yaml(name: str) -> str:
-    if name in list_catheters():
-        return catheter_yaml(name)
-    read_wire(name)
-    return device_yaml(name)[1]
 
 
 def _row(name: str) -> dict[str, Any]:

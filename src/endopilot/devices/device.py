@@ -130,8 +130,7 @@ class Device:
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
 
     def summary(self) -> dict[str, Any]:
-        """Return `name`, `diameter_mm`, stiffnesses `ei_tip_n_mm2`, `ei_shaft_n_mm2`, `gj_tip_n_mm2` and
-        `gj_shaft_n_mm2`, and `friction`."""
+        """Return `name`, `diameter_mm`, EI and GJ at tip and shaft (as `ei_tip_n_mm2`), and `friction`."""
         return {
             "name": self.name,
             "diameter_mm": self.diameter_mm,
@@ -191,8 +190,7 @@ class Wire(Device):
         return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of devices shows: `Device.summary`, the catalogue's `tip_load_n` (None where it states
-        none) and `tip_bend_deg`."""
+        """Return `Device.summary`, the catalogue's `tip_load_n` (None where it states none) and `tip_bend_deg`."""
         bend = {"tip_bend_deg": round(float(np.rad2deg(self.tip_bend_rad)), 3)}
         return Device.summary(self) | {"tip_load_n": self.tip_load_n} | bend
 
