@@ -41,7 +41,7 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def png(figure: Figure, *, dpi: float = STYLE["figure.dpi"]) -> bytes:
+def png(figure: Figure, *, dpi: int = STYLE["figure.dpi"]) -> bytes:
     """Return a figure as the bytes of a PNG file, of so many dots an inch."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi)
