@@ -34,7 +34,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 _DEEPEST_START = 0.8  # share of the longest path that a random start may lie at
 _STATE_FORMAT = 4  # of `SimulatorState`: raised when its values come to mean something else
 _PACK = 8  # worlds that count as stepped together, however many the processor steps: a budget buys the same on each
-_FEW = 4  # as many count where no more are stepped; a lane of one alone takes almost as long
+_FEW = _PACK // 2  # as many count where no more are stepped; a lane of one alone takes almost as long
 _LEAST_BYTES = 4000  # no world takes less memory; too many are refused before they are listed
 _AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds; the main thread's long runs are left to Ctrl-C, though
 
