@@ -66,7 +66,7 @@ def writing(path: Path) -> Iterator[Path]:
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
     """Write a file whole or not at all; InputError as `writing` has it."""
-    with writing(path) as partial:
+    with writing(Path(path)) as partial:
         partial.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
