@@ -146,6 +146,9 @@ def test_worlds_that_are_not_driven_stay_as_they_are_and_the_others_move_as_ever
     assert np.array_equal(some.position[moves], everyone.position[moves])
     assert not np.array_equal(some.position, everyone.position)
     assert some.time[moves] == pytest.approx(some.time[~moves][0] + 3 * PERIOD)
+    along = begun(Simulator(anatomy, devices, config=SimulatorConfig(friction_along=(1.0, 2.0))), 5)
+    with pytest.raises(InputError, match="worlds: some are given where friction differs along the vessel"):
+        along.step(control, PERIOD, worlds=moves)
 
 
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:

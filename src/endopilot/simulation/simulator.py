@@ -443,6 +443,8 @@ class Simulator(Readout):
         advance: Advance | None = None,
         worlds: Bool[np.ndarray, "worlds"] | None = None,
     ) -> dict[str, np.ndarray]:
+        if worlds is not None and self.config.friction_along:  # it is scaled in all of them
+            raise InputError("worlds: some are given where friction differs along the vessel; leave them out")
         chosen = np.arange(len(group.index)) if worlds is None else np.flatnonzero(worlds[group.index])
         run = partial(
             group.simulation.run,
