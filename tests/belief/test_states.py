@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.belief.states import SEEKS, TRANSITIONS, Event, State, States
+from endopilot.belief.states import TRANSITIONS, Event, State, States
 
 EVENTS = {"t": Event.TRUSTED, "d": Event.DOUBTED, "u": Event.UNEXPLAINED, ".": None}
 
 
-def names(told: str, seeks: int = SEEKS) -> str:
-    """Return the first letter of the state after each period of a story."""
-    states, found = States(seeks), ""
-    for each in told:
-        states.take(EVENTS[each])
+def names(told: str, sought: int = 100) -> str:
+    """Return the first letter of the state after each period of a story, in whose first periods something is sought."""
+    states, found = States(), ""
+    for period, each in enumerate(told):
+        states.take(EVENTS[each], seeks=period < sought)
         found += states.now[0]
     return found
 
@@ -29,8 +29,8 @@ def names(told: str, seeks: int = SEEKS) -> str:
         ("du", "cs"),
         ("ut", "sf"),  # a copy explains the image
         ("ud", "sc"),
-        ("uuuuuuu", "ssssssl"),  # 3 s, and an exposure in each period
-        ("u......", "ssssssl"),
+        ("uuuuuuu", "ssssssl"),  # copies, which take an exposure in each period, for 3 s
+        ("u......", "ssssssl"),  # what explains the images, without exposures
         ("uuuuuuuu..t", "ssssssllllf"),
         ("uuuuuuud", "sssssslc"),
     ],
@@ -39,14 +39,15 @@ def test_a_story_leads_from_state_to_state(told: str, expected: str) -> None:
     assert names(told) == expected
 
 
-def test_without_copies_nothing_is_sought() -> None:
-    assert names("u.ud", seeks=0) == "lllc"
+@pytest.mark.parametrize(("told", "sought", "expected"), [("u.ud", 0, "lllc"), ("u..", 2, "ssl"), ("u.d", 2, "ssc")])
+def test_what_is_no_longer_sought_is_lost(told: str, sought: int, expected: str) -> None:
+    assert names(told, sought) == expected
 
 
 def test_losses_are_counted_once_each() -> None:
-    states = States(1)
+    states = States()
     for each in "uuuuttduutu":
-        states.take(EVENTS[each])
+        states.take(EVENTS[each], seeks=True)
     assert states.losses == 3 and states.lost
 
 

@@ -17,7 +17,7 @@ from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import ahead_of_valve_n
 from endopilot.belief.identification import BETTER, Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
-from endopilot.belief.states import SEEKS, Event, States
+from endopilot.belief.states import Event, State, States
 from endopilot.belief.thought import Budget, Pace, Thought
 from endopilot.belief.watch import Innovations, Watch
 from endopilot.devices.stack import Proximals
@@ -143,7 +143,7 @@ class Monitor:
         self._navigation, self._config = navigation, config or BeliefConfig()
         self._given = Belief.around(self._config) if members is None else tuple(members)
         self.belief = Belief(navigation, self._given, self._config)
-        self.past, self.states, self.sought = Past(), States(SEEKS * bool(self._config.copies)), False
+        self.past, self.states, self.sought = Past(), States(), False
         self.identified: Identified | None = None
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
@@ -167,9 +167,14 @@ class Monitor:
         return self.states.lost
 
     @property
+    def thinks(self) -> bool:
+        """Whether it goes on that what explains the exposures is sought."""
+        return self._thought is not None
+
+    @property
     def rests(self) -> bool:
-        """Whether devices rest, without X-ray, while it is sought what explains the last image: no wire does."""
-        return self._thought is not None and not self.belief.explains
+        """Whether devices rest, without X-ray, while that goes on: no wire explains the last image."""
+        return self.thinks and self.states.now is State.SEEKING
 
     @property
     def alarm(self) -> bool:
@@ -216,7 +221,7 @@ class Monitor:
             at = predicted_tip(self.belief)
         explained = self.belief.explains if told else True
         event = Event.UNEXPLAINED if not explained else Event.DOUBTED if self.alarm else Event.TRUSTED
-        self.states.take(event if (told or back) and not self.rests else None)
+        self.states.take(event if told or back else None, seeks=self.thinks or self._config.copies > 0)
         if watch is None:
             return BelievedTip(float(at.tip[0]), float(at.tip[1]), branch=int(self.belief.tip.branch[self.belief.best]))
         if self.seen is not None:

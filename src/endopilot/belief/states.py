@@ -11,9 +11,9 @@ class State(StrEnum):
     FOLLOWING = "following"
     """The given wire explains what X-ray showed: it is driven, and looked at when the adviser asks."""
     SEEKING = "seeking"
-    """None does: the devices rest under X-ray, and copies that are moved to and fro are compared with each image."""
+    """None does: the devices rest, and it is sought what does. Copies that are moved to and fro need X-ray for that."""
     LOST = "lost"
-    """No copy does either, or there is none: the devices are pulled back until a wire explains what X-ray shows."""
+    """Nothing was found in time: the devices are pulled back until a wire explains what X-ray shows."""
     CHANGED = "changed"
     """The model erred: another wire, lumen, ostium, drive or motion is followed, under X-ray every 1.5 s."""
 
@@ -44,8 +44,8 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
 }
 """The state that follows from a state and what a period told. Devices that are back where they began, unseen, are
 explained: they lie as they did. An oracle never doubts, so it never is in `CHANGED`."""
-SEEKS = 6
-"""Periods that a belief with copies may be in `SEEKING`, an exposure each; 0 for one without copies."""
+_SEEKS = 6
+"""Periods that a belief may be in `SEEKING`."""
 
 
 class States:
@@ -56,18 +56,22 @@ class States:
         losses: how often no wire explained an image any more.
     """
 
-    def __init__(self, seeks: int) -> None:
-        """Begin in `FOLLOWING`, with so many periods that `SEEKING` may last."""
-        self.now, self.losses, self._seeks, self._sought = State.FOLLOWING, 0, seeks, 0
+    def __init__(self) -> None:
+        """Begin in `FOLLOWING`."""
+        self.now, self.losses, self._sought = State.FOLLOWING, 0, 0
 
-    def take(self, event: Event | None) -> None:
-        """Go over a period in which something was told, or nothing (None): the state then stays, as far as it may."""
+    def take(self, event: Event | None, *, seeks: bool = False) -> None:
+        """Go over a period in which something was told, or nothing (None): the state then stays, as far as it may.
+
+        Args:
+            seeks: whether it goes on that something is sought which explains the last image.
+        """
         before = self.lost
         if event is not None:
             self.now = TRANSITIONS[self.now, event]
         self.losses += self.lost and not before
         self._sought = self._sought + 1 if self.now is State.SEEKING else 0
-        if self._sought > self._seeks:
+        if self._sought > _SEEKS * seeks:
             self.now = TRANSITIONS[self.now, Event.SPENT]
 
     @property

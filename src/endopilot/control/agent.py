@@ -87,10 +87,7 @@ class _PlanningPolicy:
         """Follow the course, search another one, or pull back, as the module describes."""
         self._observe(observation)
         self._shows, lost = False, self.monitor.lost
-        if self.monitor.rests:
-            wanted = self._follower.move([0.0 for _ in self.navigation.devices])
-        else:
-            wanted = self._pull_back() if lost else self._go_on(observation)
+        wanted = self._pull_back() if lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not lost
         ends = ends and not self.monitor.may_return
@@ -146,7 +143,7 @@ class _PlanningPolicy:
             self.belief = monitor.belief
             self._begin_anew()
         self._limit_load()
-        if monitor.rests or monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
+        if monitor.sought or (monitor.seen is not None and (before or monitor.lost)):
             self._forget()  # they lie otherwise than the course was searched for
         if monitor.seen is not None:
             self._back_mm = self.belief.drives.proximal[0, 0] - self._way_back(monitor.seen)
@@ -343,7 +340,8 @@ class AgentPolicy(_PlanningPolicy):
             return replace(decision, gives_up=f"{decision.gives_up}: {given}, and {harder}")
         losses, seen = self.monitor.states.losses, self.monitor.seen
         out = self.belief.drives.proximal[0, 0] <= _OUT_MM and self.monitor.states.now is State.LOST
-        if decision.gives_up or not (losses >= self.config.losses or (out and seen is not None)):
+        lost = losses >= self.config.losses or (out and seen is not None)
+        if decision.gives_up or self.monitor.thinks or not lost:
             return self._within_dose(decision)
         at = "" if seen is None else f" at {seen.abscissa:.0f} mm"
         how = "pulled out, the wire is still seen" if out else f"lost {losses} times"
