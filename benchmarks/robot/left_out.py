@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.figures import fill
+from benchmarks.figures import fill, markdown_table
 from benchmarks.robot.paper_pair import States, predict_left_out
 from benchmarks.robot.twist import Sides, correlation, passages
 from endopilot.anatomy.io import read_anatomy
@@ -115,6 +115,23 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
     return found
 
 
+def taught(
+    logs: Sequence[RobotLog], count: int, anatomy: Anatomy, known: RobotConfig, wire: Wire, episodes: int, epochs: int
+) -> list[LeftOut]:
+    """Return the episodes of each session, predicted by what the next so many others in order teach."""
+    found, teachers = list[LeftOut](), dict[str, list[str]]()
+    for k, log in enumerate(logs):
+        others = [logs[(k + 1 + more) % len(logs)] for more in range(count)]
+        robot = calibrated(others, anatomy, known, episodes)
+        teachers[log.name] = [each.name for each in others]
+        found += predicted(prepare(usable_episodes([log], anatomy), anatomy, 0.5, known), robot, wire)
+    pairs = predict_left_out([each.states for each in found], teachers, epochs=epochs)
+    for one, made in zip(found, pairs, strict=True):
+        off, name = (made - one.states.tip)[~one.replay.given], MODELS[-1]
+        one.along[name], one.in_plane[name] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
+    return found
+
+
 def bench_left_out(
     *,
     logs: Path,
@@ -124,6 +141,7 @@ def bench_left_out(
     episodes: int = 96,
     sessions: tuple[str, ...] = ("2D",),
     epochs: int = 1,
+    teachers: tuple[int, ...] = (),
     write: bool = False,
 ) -> list[dict[str, Any]]:
     """Predict each session by what all others teach, beside an offset, play alone and kinematics alone.
@@ -136,6 +154,7 @@ def bench_left_out(
         episodes: that each calibration is fitted to at most.
         sessions: parts of the names of the logs to take.
         epochs: that the paper's forward network is trained for.
+        teachers: numbers of other sessions that teach, the next ones in order, for a learning curve, in place of all.
         write: write the tables of docs/evidence/reality.md.
 
     Returns:
@@ -146,16 +165,17 @@ def bench_left_out(
         raise InputError(f"{logs}: {len(paths)} logs of {', '.join(sessions)}; a band for another one needs 3")
     patient, known, wire = read_anatomy(anatomy), read_robot(robot), read_wire(device)
     read = [read_log(path) for path in paths]
-    of: dict[str, list[LeftOut]] = {}
-    for log in read:
-        found = calibrated([each for each in read if each is not log], patient, known, episodes)
-        of[log.name] = predicted(prepare(usable_episodes([log], patient), patient, 0.5, known), found, wire)
-    everything = [one for each in of.values() for one in each]
-    for one, made in zip(
-        everything, predict_left_out([each.states for each in everything], epochs=epochs), strict=True
-    ):
-        off = (made - one.states.tip)[~one.replay.given]
-        one.along["the paper's pair"], one.in_plane["the paper's pair"] = np.abs(off[:, 0]), np.linalg.norm(off, axis=1)
+    if too_many := [count for count in teachers if not 0 < count < len(read)]:
+        raise InputError(f"teachers: {too_many[0]}; there are 1 to {len(read) - 1} other sessions")
+
+    setting = patient, known, wire, episodes, epochs
+    if teachers:
+        rows = [{"sessions that teach": count} | _learned(taught(read, count, *setting)) for count in teachers]
+        if write:
+            fill("evidence/reality.md", "curve", markdown_table(rows[0], (row.values() for row in rows)))
+        return rows
+    everything = taught(read, len(read) - 1, *setting)
+    of = {log.name: [one for one in everything if one.states.session == log.name] for log in read}
     tables = []
     for name, each in of.items():
         others = [(one, other) for other, some in of.items() if other != name for one in some]
@@ -171,6 +191,16 @@ def bench_left_out(
         for name, held, figures in tables
         for model in MODELS
     ]  # fmt: skip
+
+
+def _learned(of: Sequence[LeftOut]) -> dict[str, str]:
+    """Return medians of the errors of what learns from other sessions, mm."""
+    learned = "kinematics", "the paper's pair"
+    return {
+        f"{model}, {title}": _with_bounds([float(np.median(getattr(each, what)[model])) for each in of])
+        for what, title in (("along", "along"), ("in_plane", "in plane"))
+        for model in learned
+    }
 
 
 def _ray(log: RobotLog) -> Float[np.ndarray, "3"]:

@@ -7,7 +7,7 @@ given part is shorter than the 30 states that the paper gives begins at rest for
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,11 +51,18 @@ def windows(episodes: Sequence[States]) -> tuple[Windows, list[int]]:
     return Windows(*(torch.as_tensor(each, dtype=torch.float32) for each in (tip, drive, control))), rest
 
 
-def predict_left_out(episodes: Sequence[States], *, epochs: int) -> list[Float[np.ndarray, "tips 2"]]:
-    """Return (Δtip, side) of each episode: given ones, then what the network of all other sessions predicts."""
+def predict_left_out(
+    episodes: Sequence[States], teachers: Mapping[str, Sequence[str]], *, epochs: int
+) -> list[Float[np.ndarray, "tips 2"]]:
+    """Return (Δtip, side) of each episode: given ones, then what a network predicts.
+
+    Args:
+        teachers: by the session of an episode, those which its network is trained on.
+        epochs: of the training.
+    """
     found: dict[int, np.ndarray] = {}
     for name in dict.fromkeys(each.session for each in episodes):
-        training, _ = windows([each for each in episodes if each.session != name])
+        training, _ = windows([each for each in episodes if each.session in teachers[name]])
         with tempfile.TemporaryDirectory() as folder:
             config = TrainConfig(network="ff", epochs=epochs, batch_size=64, processor="cpu")
             network, _ = Job("ff", config, training, None, Path(folder)).run()
