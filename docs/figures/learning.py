@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from endopilot.files import read_json, write_json
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
+from endopilot.simulation.engine_simulator import ENGINES
 
 WORLDS = {
     "dataset": "as the model knows it, wires of ±20 %",
@@ -35,7 +37,8 @@ WORLDS = {
     "deeper-ostium": "a deeper ostium",
     "both": "heart and breath",
 }
-MODELS = {"wires": "simulated wires", "paper": "the paper's pair", "networks": "causal networks, removed since"}
+MODELS = {"wires": "simulated wires", "paper": "the paper's pair"}
+TRUTHS = {"kirchhoff": "another engine", "rod": "the same core, wires of ±20 %"}
 SPANS = ((0, 20), (20, 60), (60, 90))
 
 
@@ -51,14 +54,52 @@ def spans(error: np.ndarray) -> list[list[float]]:
     return [[float(of(error[:, a:b, i])) for a, b in SPANS for of in (np.mean, np.median)] for i in (0, 1)]
 
 
-def measured(folder: Path, model: str) -> dict[str, Any]:
-    """Return P1 and the advice of a model."""
-    run = model if model == "wires" else folder / model
-    episodes = Episodes.of_dataset(first_of_each(folder / "dataset", "test"))
-    start = time.process_time()
-    tip = load_model(run).rollout_forward(episodes).tip
-    found: dict[str, Any] = {"p1_cpu_s_per_nav": (time.process_time() - start) / len(episodes)}
-    found["p1"], config = spans(np.abs(tip - episodes.tip[:, WINDOW:])), AdviseConfig()
+def driven(data: Dataset, engine: str, *, as_given: bool = False) -> Dataset:
+    """Return navigations with the tips to which the commands lead true wires in an engine, or the wire as given."""
+    tips = []
+    for k in range(len(data)):
+        of = data[k].set_up()
+        stack = data.stack if as_given else of.stacks[0]
+        friction = stack.frictions(np.full(1, stack.wire.friction)) if as_given else of.friction
+        simulator = ENGINES[engine](of.anatomies, [stack], config=of.config)
+        simulator.reset(inserted_length=of.initial[..., 0], rotation=of.initial[..., 1], friction=friction)
+        tips.append(simulator.run(data[k].command, period_s=data.sample_period_s).tip)
+    return replace(
+        data,
+        tip_abscissa=np.concatenate([tip.abscissa for tip in tips]),
+        tip_offset=np.concatenate([tip.offset for tip in tips]),
+    )
+
+
+def predicted(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what P1 errs by, by what moves the true wire and who predicts: `spans`, and s of a core a navigation."""
+    data, found = first_of_each(folder / "dataset", "test"), dict[str, dict[str, Any]]()
+    given = Episodes.of_dataset(driven(data, "rod", as_given=True)).tip[:, WINDOW:]
+    for engine in TRUTHS:
+        moved = driven(data, engine)
+        true = Episodes.of_dataset(moved)
+        rows = {"the wire as given": (given, 0.0), "held slack and offset": (hold_slack(moved), 0.0)}
+        for model, title in MODELS.items():
+            if (run := run_of(folder, model)) is not None:
+                start = time.process_time()
+                tip = load_model(run).rollout_forward(true).tip
+                rows[title] = tip, (time.process_time() - start) / len(data)
+        found[engine] = {
+            title: [spans(np.abs(tip - true.tip[:, WINDOW:])), seconds] for title, (tip, seconds) in rows.items()
+        }
+    return found
+
+
+def run_of(folder: Path, model: str) -> str | Path | None:
+    """Return what names a model for `load_model`; None where it was not trained."""
+    if model == "wires":
+        return model
+    return folder / model if (folder / model / "manifest.json").exists() else None
+
+
+def measured(folder: Path, run: str | Path) -> dict[str, Any]:
+    """Return the advice of a model."""
+    found, config = dict[str, Any](), AdviseConfig()
 
     def followed(name: str, split: str, bands: Calibration | None = None) -> list[Followed]:
         return follow_all(first_of_each(folder / name, split), follows(Path(run)), config, bands)[0]
@@ -80,18 +121,14 @@ def measured(folder: Path, model: str) -> dict[str, Any]:
     return found
 
 
-def p1_rows(folder: Path, models: dict[str, dict[str, Any]]) -> Iterator[str]:
+def p1_rows(found: dict[str, dict[str, Any]]) -> Iterator[str]:
     """Yield the rows of P1: mean and median of both errors over the spans, mm, and processor time."""
-    yield "| | Δtip | γtip | processor, s a navigation |"
-    yield "|---|---|---|---|"
-    data = first_of_each(folder / "dataset", "test")
-    held = np.abs(hold_slack(data) - Episodes.of_dataset(data).tip[:, WINDOW:])
-    for name, p1, seconds in [
-        *((MODELS[name], found["p1"], f"{found['p1_cpu_s_per_nav']:.1f}") for name, found in models.items()),
-        ("held slack and offset", spans(held), "–"),
-    ]:
-        cells = [" ".join(f"{each[k]:.3f} ({each[k + 1]:.3f})" for k in (0, 2, 4)) for each in p1]
-        yield f"| {name} | {cells[0]} | {cells[1]} | {seconds} |"
+    yield "| truth | | Δtip | γtip | processor, s a navigation |"
+    yield "|---|---|---|---|---|"
+    for engine, truth in TRUTHS.items():
+        for title, (errors, seconds) in found[engine].items():
+            cells = [" ".join(f"{each[k]:.3f} ({each[k + 1]:.3f})" for k in (0, 2, 4)) for each in errors]
+            yield f"| {truth} | {title} | {cells[0]} | {cells[1]} | {f'{seconds:.1f}' if seconds else '–'} |"
 
 
 def advice_rows(models: dict[str, dict[str, Any]]) -> Iterator[str]:
@@ -117,9 +154,12 @@ if __name__ == "__main__":
     folder, models = Path(sys.argv[1]), {}
     for model in MODELS:
         path = folder / f"figures-{model}.json"
-        if not path.exists() and (model == "wires" or (folder / model / "manifest.json").exists()):
-            write_json(path, measured(folder, model))
+        if not path.exists() and (run := run_of(folder, model)) is not None:
+            write_json(path, measured(folder, run))
         if path.exists():
             models[model] = read_json(path)
-    fill("evidence/learning.md", "headline", p1_rows(folder, models))
+    path = folder / "figures-p1.json"
+    if not path.exists():
+        write_json(path, predicted(folder))
+    fill("evidence/learning.md", "headline", p1_rows(read_json(path)))
     fill("evidence/advice.md", "worlds", advice_rows(models))
