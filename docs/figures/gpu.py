@@ -66,7 +66,7 @@ def recipe_rows(folder: Path) -> list[dict[str, Any]]:
 def main() -> None:
     """Run the measurements."""
     gpu = output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader").splitlines()[0]
-    test = ["tests/simulation/test_processor.py", "-k", "a_gpu_agrees_with_the_processor", "-rs"]
+    test = ["tests/simulation/test_same_bits.py", "-k", "a_gpu_agrees_with_the_processor", "-rs"]
     agreement = output(sys.executable, "-m", "pytest", *test)
     if "1 passed" not in agreement:
         sys.exit(agreement)

@@ -1,9 +1,10 @@
-"""How commands are called: options, help, files of options, and what a bad one is answered."""
+"""How commands are called: options, help, files of options, what a bad one is answered, and what Tab completes."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -268,3 +269,26 @@ def test_random_navigations_stop_short_of_ends(vessel, tmp_path, capsys):
     figures = figures_of(capsys, "simulate", vessel, "-o", tmp_path / "run.csv", *options)
     assert figures["valid_worlds"] == 3
     assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= 35.5
+
+
+ASK = 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _endopilot; echo "${COMPREPLY[@]}"'
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
+def test_tab_completes_in_fish():
+    ask = f"{sys.executable} -m endopilot.cli completion fish | source; complete -C 'endopilot xray --show '"
+    made = subprocess.run(["fish", "--no-config", "-c", ask], capture_output=True, text=True, check=True)
+    assert made.stdout.split() == ["contrast", "dsa", "fluoroscopy", "roadmap"]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_tab_completes(capsys, tmp_path):
+    (tmp_path / "script").write_text(output_of(capsys, "completion"))
+    for words, completed in (
+        (["endopilot", "na"], "navigate"),
+        (["endopilot", "navigate", "patient", "--tar"], "--target"),
+        (["endopilot", "xray", "--show", ""], "fluoroscopy contrast dsa roadmap"),
+        (["endopilot", "navigate", "patient", "--robot", ""], ""),  # bash goes on with files
+    ):
+        line = ["bash", "-c", ASK, tmp_path / "script", *words]
+        assert subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip() == completed

@@ -77,6 +77,14 @@ def serving(*arguments):
         server.stop()
 
 
+def ready(unit):
+    """Return an X-ray unit whose C-arm stands still."""
+    end = time.monotonic() + 20
+    while not unit.ready and time.monotonic() < end:
+        time.sleep(0.01)
+    return unit
+
+
 def shown(film, *, start=True):
     """Return a film that was driven to its end."""
     if start:

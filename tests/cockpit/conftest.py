@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
+from browser import ready
 
 
 @pytest.fixture
@@ -25,10 +24,7 @@ def world(navigation):
 def xray(navigation):
     from endopilot.cockpit.open import xray_unit
 
-    unit = xray_unit(navigation, None)
-    until = time.monotonic() + 20
-    while not unit.ready and time.monotonic() < until:
-        time.sleep(0.01)
+    unit = ready(xray_unit(navigation, None))
     yield unit
     unit.close()
 

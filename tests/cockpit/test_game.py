@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from browser import shown
+from browser import ready, shown
 
 from endopilot.cockpit import game
 from endopilot.cockpit.film import ReplayStage, open_film
@@ -130,10 +129,7 @@ def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xra
                 if played.world.cycle:
                     played = resume_session(path).stage
                     assert played.world.config.robot == played._tried.robot == tried.robot != RobotConfig()
-                    until = time.monotonic() + 20
-                    while not played.xray.ready and time.monotonic() < until:
-                        time.sleep(0.01)
-                    assert played.phase == "waits" and not played.sight
+                    assert ready(played.xray).ready and played.phase == "waits" and not played.sight
                     played.handle(Game(type="game", action="start"), 0.0)
                 play(played, Drive(type="drive", translation=15.0, rotation=0.5), seconds, until_over=True)
             assert played.phase == "over"

@@ -1,16 +1,23 @@
-"""Trajectories: driven again to the bit, thinned, written and read back, and gathered step by step."""
+"""Trajectories: driven again to the bit, thinned, written, read back and gathered; and their signals."""
 
 from __future__ import annotations
 
 import json
+import re
+import runpy
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import endopilot
+from endopilot import _core
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.dataset.loader import Dataset
+from endopilot.dataset.schema import OWN_COLUMNS, STATE
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack, Transmission
@@ -18,8 +25,10 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.robots import Recorder
-from endopilot.simulation.trajectory import Trajectory, read_trajectory
+from endopilot.simulation.signals import SIGNALS, Outputs, table_columns
+from endopilot.simulation.trajectory import Step, Trajectory, read_trajectory, trajectory_table
 from endopilot.types import Anatomy, TipProjection
+from toy_evaluation import make_trajectory
 
 WIRE, CATHETER = read_wire("workhorse-014"), read_catheter("microcatheter-1.7f")
 PAIR = Stack(WIRE, (CATHETER,))
@@ -187,34 +196,23 @@ def _refused(path: Path, anatomy, message: str) -> None:
     assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
 
 
-@pytest.mark.parametrize("devices", [1, 2])
-def test_a_recorder_gives_what_a_run_gives_to_the_bit(vessel, devices) -> None:
-    stack, (start, control) = Stack(WIRE, PAIR.catheters[: devices - 1]), drives(2, devices)
+@pytest.mark.parametrize("stack", [Stack(WIRE), PAIR], ids=["wire", "pair"])
+def test_a_recorder_gives_what_a_run_gives_to_the_bit(vessel, stack) -> None:
+    """In a longer and a shorter vessel: nodes that neither needs are left out, those that one lacks are NaN."""
+    vessels, (start, control) = [vessel, make_patient(AtlasConfig(count=2), 1)], drives(2, len(stack))
 
     def begun() -> endopilot.Simulator:
-        simulator = endopilot.Simulator(vessel, stack, worlds=2, motion=Motion())
+        simulator = endopilot.Simulator(vessels, [stack, stack], motion=Motion())
         simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
         return simulator
 
-    recorder = Recorder(begun(), 0.5, record_shape=True)
+    recorder = Recorder(simulator := begun(), 0.5, record_shape=True)
     for sample in range(SAMPLES):
         recorder.step(control[:, sample])
     gathered = recorder.trajectory()
+    assert gathered.shape is not None and np.isnan(gathered.shape).any() and gathered.shape.shape[2] < simulator.nodes
     assert_same(gathered, begun().run(control, record_shape=True))
     assert_same(gathered.replay(), gathered)
-
-
-def test_shapes_in_a_longer_and_a_shorter_vessel_are_recorded_alike(vessel) -> None:
-    """Nodes that neither needs are left out, and those that the shorter one lacks are NaN."""
-    vessels, control = [vessel, make_patient(AtlasConfig(count=2), 1)], np.zeros((2, 2, 1, 2))
-    control[0, :, 0, 0] = 10.0
-    first, second = (endopilot.Simulator(vessels, [WIRE, WIRE]) for _ in range(2))
-    recorder = Recorder(first, 0.5, record_shape=True)
-    for sample in range(2):
-        recorder.step(control[:, sample])
-    gathered = recorder.trajectory()
-    assert gathered.shape is not None and np.isnan(gathered.shape).any() and gathered.shape.shape[2] < first.nodes
-    assert_same(gathered, second.run(control, record_shape=True))
 
 
 def test_a_wire_alone_needs_no_axis_of_devices(vessel, wire_alone) -> None:
@@ -237,3 +235,57 @@ def test_a_stack_needs_its_axis_of_devices(vessel) -> None:
         endopilot.simulate(vessel, PAIR, control, initial=start[:, 0])
     with pytest.raises(InputError, match="device: stacks of 1 and of 2 devices; give worlds of one number"):
         endopilot.Simulator(vessel, [WIRE, PAIR])
+
+
+RECORDED = {name: (of, numbers) for name, of, numbers, *_ in _core.OUTPUTS if of in ("device", "sample")}
+
+
+def test_a_step_has_each_output_of_the_core_with_its_axes() -> None:
+    types: dict[str, Any] = {each.name: each.type for each in fields(Step)}
+    declared = {name: each.dim_str for name, each in types.items()}
+    axes = {"device": "*each devices", "sample": "*each"}
+    assert declared == {name: axes[of] + (f" {n}" if n > 1 else "") for name, (of, n) in RECORDED.items()}
+    assert set(declared) <= {each.name for each in fields(Trajectory)}
+
+
+def test_every_output_is_described_and_has_its_columns_in_tables_and_in_data_sets() -> None:
+    table = trajectory_table(make_trajectory())
+    for name in RECORDED:
+        assert f"\n        {name}: {SIGNALS[name].meaning}" in (Trajectory.__doc__ or ""), name
+        assert SIGNALS[name].columns and set(SIGNALS[name].columns) <= set(table.columns), name
+    stored = {name for name, *_ in OWN_COLUMNS.values()} | set(STATE)
+    assert stored >= {each.name for each in fields(Outputs)}
+    columns = [column for each in SIGNALS.values() for column in each.columns]
+    assert len(columns) == len(set(columns))
+
+
+@pytest.mark.parametrize("kind", [Dataset, Trajectory])
+def test_no_attribute_is_described_twice(kind) -> None:
+    named = re.findall(r"^ {8}(\w+): ", kind.__doc__, re.MULTILINE)
+    assert "valid" in named and len(named) == len({*named})
+
+
+def test_columns_of_devices_come_one_device_after_the_other() -> None:
+    position, force = np.arange(12.0).reshape(2, 2, 3), np.array([0.1, 0.2])
+    found = table_columns({"wall_force": force, "tip_position": position})
+    assert list(found) == [
+        *(f"tip_{axis}_mm" for axis in "xyz"),
+        *(f"catheter_1_tip_{axis}_mm" for axis in "xyz"),
+        "wall_force_n",
+    ]
+    np.testing.assert_array_equal(found["catheter_1_tip_y_mm"], position[:, 1, 1])
+
+
+def test_further_signals_are_columns_of_a_table_by_their_rows_or_their_own_name() -> None:
+    made = make_trajectory(2)
+    further = {"believed": np.arange(4.0).reshape(1, 2, 2), "mine": np.array([[5.0, 6.0]])}
+    table = trajectory_table(replace(made, columns=further))
+    expected = {"believed_tip_abscissa_mm": [0, 2], "believed_tip_offset_mm": [1, 3], "mine": [5, 6]}
+    found = pd.DataFrame({name: table[name] for name in expected})
+    pd.testing.assert_frame_equal(found, pd.DataFrame(expected, dtype=float))
+
+
+def test_the_documentation_lists_the_signals() -> None:
+    script = Path(__file__).parents[2] / "docs/signals.py"
+    made = runpy.run_path(str(script))
+    assert made["PAGE"].read_text(encoding="utf-8") == made["page"]()

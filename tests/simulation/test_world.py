@@ -209,6 +209,8 @@ def test_what_is_drawn_follows_the_seed_and_what_is_given_stays(fork):
         assert each.tip_stiffness_factor == 1.5 and 0 <= each.axis_side_deg < 360
         assert each.drawn(fork, 7) == each
     assert world.drawn(fork, 0) == drawn[0] != drawn[1]
+    told = (drawn[2].friction_factor, drawn[2].latency_factor, round(drawn[2].axis_side_deg, 6))
+    assert told == (1.2, 0.8, 193.853634)  # as in all navigations that were recorded
 
 
 def test_a_file_holds_a_world(tmp_path):

@@ -224,7 +224,7 @@ def write_block(
     started = time.process_time()
     config, anatomy, stack = layout.config, _read(block.patient.folder, block.patient.identity), layout.stack
     draw = draw_navigations(config, stack.wire, anatomy, block.sequences, devices=len(stack))
-    world = layout.world.leaning(config.seed)
+    world = layout.world.drawn(anatomy, config.seed)
     stacks = stacks_with_tips(stack, world, draw.tip_bend_rad, draw.tip_stiffness_factor)
     set_up = SimulationSetUp(
         anatomies=[world.anatomy(anatomy)] * len(stacks),

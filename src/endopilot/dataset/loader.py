@@ -158,7 +158,7 @@ class Dataset(Outputs):
         record = self.manifest.get("world", {})
         if record is None:
             raise InputError(f"{self.folder}: holds episodes of several worlds; give the dataset of one world")
-        return from_record(World, record, onto=World()).leaning(self.manifest["seed"])
+        return from_record(World, record, onto=World()).drawn(None, self.manifest["seed"])
 
     @property
     def patients(self) -> dict[str, str]:

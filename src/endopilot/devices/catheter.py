@@ -13,20 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced, TipShaping, Wire, WireFile, check_built, file_constants
-from endopilot.devices.device_files import (
-    MOST_VALUES,
-    Abscissa,
-    ArcLength,
-    Force,
-    Friction,
-    Rotation,
-    Stiffness,
-    Torque,
-    Velocity,
-    Width,
-    named_file,
-)
+from endopilot.devices.device import Device, DeviceFile, Sourced, Wire, WireFile, check_built, file_constants
+from endopilot.devices.device_files import MOST_VALUES, ArcLength, Friction, Width, named_file
 from endopilot.errors import InputError
 from endopilot.files import read_text, write_yaml
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
@@ -78,26 +66,20 @@ class _Shape:
 
 
 @settings
-class CatheterFile:
-    """What a catheter's file holds; `Catheter` says what each constant means.
+class CatheterFile(DeviceFile):
+    """What a catheter's file holds; `Catheter` says what each constant means."""
 
-    The order of the fields is part of the identity of tasks that hold a catheter.
-    """
-
-    name: Text
-    diameter_mm: Sourced[Width]
     inner_diameter_mm: Sourced[Width]
-    abscissa_mm: Sourced[tuple[Abscissa, ...]]
-    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
-    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
-    shape: _Shape
-    friction: Sourced[Friction]
     bore_friction: Sourced[Friction]
-    max_velocity_mm_s: Sourced[Velocity]
-    max_rotation_rad_s: Sourced[Rotation]
-    push_limit_n: Sourced[Force]
-    pull_limit_n: Sourced[Force]
-    torque_limit_n_mm: Sourced[Torque]
+    shape: _Shape
+
+
+_ORDER = (
+    *("diameter_mm", "inner_diameter_mm", "abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2", "shape"),
+    *("friction", "bore_friction", "max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n", "pull_limit_n"),
+    "torque_limit_n_mm",
+)
+"""Of what a catheter's file holds: that of its sources is part of the identity of tasks that hold one."""
 
 
 def list_catheters() -> tuple[str, ...]:
@@ -111,7 +93,7 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     content = read_settings(path, CatheterFile)
     shape = tuple((length, math.radians(angle)) for length, angle in content.shape.arcs)
     try:
-        catheter = Catheter(**file_constants(content), shape=shape)
+        catheter = Catheter(**file_constants(content, _ORDER), shape=shape)
         check_built(catheter, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
         return catheter
     except InputError as error:
@@ -141,10 +123,10 @@ def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
 def write_device(device: Wire | Catheter, *, output: str | Path) -> None:
     """Write a device as a YAML file that `read_wire` or `read_catheter` reads back; InputError if it cannot."""
     content: dict[str, Any] = {"name": device.name}
-    for each in fields(WireFile if isinstance(device, Wire) else CatheterFile):
-        value = _written(device, each.name)
-        if each.name != "name" and value is not None:
-            content[each.name] = value | {"source": device.sources[each.name]}
+    of_wire = (field.name for field in fields(WireFile) if field.name != "name")
+    for name in of_wire if isinstance(device, Wire) else _ORDER:
+        if (value := _written(device, name)) is not None:
+            content[name] = value | {"source": device.sources[name]}
     write_yaml(Path(output), content)
 
 
@@ -160,6 +142,6 @@ def _written(device: Wire | Catheter, name: str) -> dict[str, Any] | None:
         angle_deg = angle_deg if exact else math.degrees(device.tip_bend_rad)
         return {"angle_deg": angle_deg, "length_mm": device.tip_bend_length_mm}
     value = getattr(device, name)
-    if isinstance(value, TipShaping):
-        return {"angle_deg": list(value.angle_deg), "length_mm": list(value.length_mm)}
-    return None if name == "tip_shaping" else {"value": list(value) if isinstance(value, tuple) else value}
+    if name == "tip_shaping":
+        return value and {"angle_deg": list(value.angle_deg), "length_mm": list(value.length_mm)}
+    return {"value": list(value) if isinstance(value, tuple) else value}

@@ -222,8 +222,8 @@ class _Shaping(TipShaping):
 
 
 @settings
-class WireFile:
-    """What a wire's file holds; `Wire` says what each constant means."""
+class DeviceFile:
+    """What a wire's and a catheter's file hold alike; `Device` says what each constant means."""
 
     name: Text
     diameter_mm: Sourced[Width]
@@ -236,14 +236,22 @@ class WireFile:
     abscissa_mm: Sourced[tuple[Abscissa, ...]]
     bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
     twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+
+
+@settings
+class WireFile(DeviceFile):
+    """What a wire's file holds; `Wire` says what each constant means."""
+
     tip_load_n: Sourced[TipLoad | None]
     tip_bend: _TipBend
     tip_shaping: _Shaping | None = None
 
 
-def file_constants(content: Any) -> dict[str, Any]:
-    """Return name, constants and sources that a device's file holds, as the device takes them."""
-    entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
+def file_constants(content: DeviceFile, order: Sequence[str] = ()) -> dict[str, Any]:
+    """Return name, constants and sources that a device's file holds, as the device takes them; in an order of its own,
+    if one is given."""
+    names = order or [field.name for field in fields(content) if field.name != "name"]
+    entries = {name: getattr(content, name) for name in names}
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     sources = {name: entry.source for name, entry in entries.items() if entry is not None}
     return {"name": content.name, **constants, "sources": sources}

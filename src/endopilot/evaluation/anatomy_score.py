@@ -41,17 +41,13 @@ class Agreement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnatomyScore:
-    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more: Dice of the
-    lumen's voxels beyond the ostium, `cl_dice`, and the measures of `Agreement`."""
+class AnatomyScore(Agreement):
+    """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more; besides, Dice of
+    the lumen's voxels beyond the ostium, and `cl_dice`."""
 
     dice: float
     cldice: float
-    overlap: float
-    inside_accuracy_mm: float
-    radius_mae_mm: float
     ostium_error_mm: float
-    false_length_mm: float
 
 
 def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> AnatomyScore:

@@ -1,5 +1,4 @@
-"""NIfTI-1 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical
-coordinates."""
+"""NIfTI-1 files (https://nifti.nimh.nih.gov), read as their standard says, placed by anatomical coordinates."""
 
 from __future__ import annotations
 
@@ -117,6 +116,7 @@ def _named_labels(content: bytes, order: str) -> tuple[Segment, ...]:
     return ()
 
 
+@np.errstate(invalid="ignore")  # of a signalling NaN, which is refused as any other
 def _placed(voxels: np.ndarray, header: Any, path: Path) -> Volume:
     """Return voxels where sform and qform put them: where both are given they agree, or one is the scanner's."""
     qform_code, sform_code = header["codes"].tolist()

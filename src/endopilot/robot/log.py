@@ -126,11 +126,8 @@ def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence
             f"{path}: is no log of a robot: column translation_mm, or translation_mm_s, is missing, where the drive is "
             f"sent; it has {', '.join(table.header[:8])}{' …' if len(table.header) > 8 else ''}"
         )
-    time_s = table.values["time_s"]
-    back = np.flatnonzero(np.diff(time_s) < 0)
-    if len(back):
-        raise table.fault(int(back[0]) + 1, "time_s", " is before the row above; sort the rows by time")
-    episode = _whole(table, "episode", len(time_s))
+    table.ascends("time_s", by="time")
+    time_s, episode = table.values["time_s"], table.whole("episode")
     command = np.stack([_command(table, p, time_s, episode) for p in prefixes[:devices]], axis=1)
     if not np.isfinite(command[:, 0, 0]).any():
         raise InputError(f"{path}: translation_mm: holds no command; give one")
@@ -151,18 +148,10 @@ def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence
         load=np.stack([_group(table, p, _LOAD) for p in prefixes[:devices]], axis=1),
         tip=_group(table, "", _TIP),
         pixel=pixel,
-        used=_whole(table, "flag", len(time_s)) == 0,
+        used=table.whole("flag") == 0,
         camera=camera if np.isfinite(pixel).any() else None,
         by_velocity=_VELOCITY[0] in table.values,
     )
-
-
-def _whole(table: Columns, name: str, rows: int) -> Int[np.ndarray, "rows"]:
-    values = table.values.get(name, np.zeros(rows))
-    odd = np.flatnonzero(values != np.round(values))
-    if len(odd):
-        raise table.fault(int(odd[0]), name, "; give a whole number")
-    return values.astype(np.int64)
 
 
 def _group(table: Columns, prefix: str, names: tuple[str, ...]) -> Float[np.ndarray, "rows n"]:

@@ -162,9 +162,7 @@ def _rows_of_worlds(table: Columns) -> Int[np.ndarray, "worlds samples"]:
     if "world" not in table.values:
         return np.arange(len(table.lines))[None]
     world = table.values["world"]
-    odd = np.flatnonzero((world != np.round(world)) | (world < 0))
-    if len(odd):
-        raise table.fault(int(odd[0]), "world", "; give a whole number of 0 or more")
+    table.refuse((world != np.round(world)) | (world < 0), "world", "; give a whole number of 0 or more")
     numbers, counts = np.unique(world, return_counts=True)
     if counts.min() < counts.max():
         few = int(np.argmin(counts))

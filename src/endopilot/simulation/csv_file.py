@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from endopilot.errors import InputError, Remark
 from endopilot.files import read_text
@@ -37,6 +37,23 @@ class Columns:
     def fault(self, row: int, name: str, what: str) -> InputError:
         """Return what to raise about a row's value in a column: file, line, column, value and `what` is wrong."""
         return InputError(f"{self.path}: row {self.lines[row]}: {name} = {self.values[name][row]:.10g}{what}")
+
+    def refuse(self, bad: Bool[np.ndarray, "rows"], name: str, what: str) -> None:
+        """Raise `fault` about the first row whose value in a column is bad, if there is one."""
+        if bad.any():
+            raise self.fault(int(np.argmax(bad)), name, what)
+
+    def whole(self, name: str, default: int = 0) -> Int[np.ndarray, "rows"]:
+        """Return a column of whole numbers, or a default in each row; raise `fault` about one that is none."""
+        values = self.values.get(name, np.full(len(self.lines), float(default)))
+        self.refuse(values != np.round(values), name, "; give a whole number")
+        return values.astype(np.int64)
+
+    def ascends(self, name: str, by: str) -> None:
+        """Raise `fault` about the first row that comes before the one above it in a column."""
+        values = self.values[name]
+        back = np.diff(values, prepend=values[:1]) < 0
+        self.refuse(back, name, f" is before the row above; sort the rows by {by}")
 
 
 def read_columns(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -39,9 +38,6 @@ from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 NOMINAL = "nominal"  # name of the world that is as it is given
-QUANTITIES = ("friction", "stiffness", "latency", "ostium")
-"""What `World.share` makes differ: friction coefficient, stiffness of the tip, the robot's latency, and the position of
-the ostium along the catheter's axis, the last in units of the lumen's diameter there."""
 _SHIPPED = Path(__file__).parent / "worlds"
 _Factor = Annotated[float, Within(0.05, 100)]
 
@@ -152,19 +148,18 @@ class World:
             raise ValueError(f"engine: {self.engine} with {clash}; leave one of them out")
         return self
 
-    def drawn(self, anatomy: Anatomy, seed: int) -> World:
-        """Return the world with what a navigation's seed draws: the sides, also of the catheter's lean."""
-        change = drawn_sides(self.share, np.random.default_rng([seed, 3]))
-        world = replace(differing(change, anatomy, self), share=0.0) if self.share else self
-        return world.leaning(seed)
-
-    def leaning(self, seed: int) -> World:
-        """Return the world with the side to which its catheter leans, which the seed of the navigation draws."""
-        if not self.axis_deg or self.axis_side_deg is not None:
-            return self
+    def drawn(self, anatomy: Anatomy | None, seed: int) -> World:
+        """Return the world with what a navigation's seed draws: the sides of `share`, which takes the anatomy, and that
+        to which the catheter leans."""
         random = np.random.default_rng([seed, 3])
-        drawn_sides(0.0, random)  # which are drawn first
-        return replace(self, axis_side_deg=float(random.uniform(0.0, 360.0)))
+        friction, stiffness, latency, ostium = (self.share * random.choice([-1.0, 1.0], 4)).tolist()
+        drawn = {"axis_side_deg": float(random.uniform(0.0, 360.0))} if self.axis_deg else {}
+        if anatomy is not None and self.share:
+            drawn |= {"friction_factor": 1 + friction, "tip_stiffness_factor": 1 + stiffness}
+            diameter_mm = 2 * float(anatomy.tree.branches[0].centerline.radius[0])
+            drawn |= {"latency_factor": 1 + latency, "ostium_mm": ostium * diameter_mm}
+        own = self.differences().keys() - {"share"}
+        return replace(self, share=0.0, **{name: value for name, value in drawn.items() if name not in own})
 
     def wire(self, given: Wire) -> Wire:
         """Return a wire as it is in reality."""
@@ -247,24 +242,6 @@ def read_world(name_or_path: str | Path) -> World:
         return World()
     path = named_file("world", name_or_path, (_SHIPPED,), list_worlds)
     return read_settings(path, World, onto=World())
-
-
-def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:
-    """Return by which share each of `QUANTITIES` differs: all by the same, each up or down."""
-    return dict(zip(QUANTITIES, (share * random.choice([-1.0, 1.0], 4)).tolist(), strict=True))
-
-
-def differing(change: Mapping[str, float], anatomy: Anatomy, world: World) -> World:
-    """Return a world in which some of `QUANTITIES` differ by a share where they did not differ before; the unit of the
-    ostium's place is its lumen."""
-    diameter_mm, nominal = 2 * float(anatomy.tree.branches[0].centerline.radius[0]), World()
-    values = {
-        "friction_factor": 1 + change.get("friction", 0.0),
-        "tip_stiffness_factor": 1 + change.get("stiffness", 0.0),
-        "latency_factor": 1 + change.get("latency", 0.0),
-        "ostium_mm": change.get("ostium", 0.0) * diameter_mm,
-    }
-    return replace(world, **{n: v for n, v in values.items() if getattr(world, n) == getattr(nominal, n)})
 
 
 @lru_cache(maxsize=1)

@@ -38,17 +38,10 @@ def read_frames(path: str | Path, *, views: int = 1) -> tuple[DeviceFrame, ...]:
         InputError: no such table; the line names file, row, column and mend.
     """
     table = read_columns(Path(path), ["frame", "column_px", "row_px"], ["view"])
-    frame, view = table.values["frame"], table.values.get("view", np.ones(len(table.lines)))
+    frame, view = table.whole("frame"), table.values.get("view", np.ones(len(table.lines)))
     pixels = np.column_stack([table.values["column_px"], table.values["row_px"]])
-    odd = np.flatnonzero(frame != np.round(frame))
-    if len(odd):
-        raise table.fault(int(odd[0]), "frame", "; give a whole number")
-    back = np.flatnonzero(np.diff(frame) < 0)
-    if len(back):
-        raise table.fault(int(back[0]) + 1, "frame", " is before the row above; sort the rows by frame")
-    odd = np.flatnonzero(~np.isin(view, np.arange(1, views + 1)))
-    if len(odd):
-        raise table.fault(int(odd[0]), "view", f"; give 1 to {views}, or a camera for each view")
+    table.ascends("frame", by="frame")
+    table.refuse(~np.isin(view, np.arange(1, views + 1)), "view", f"; give 1 to {views}, or a camera for each view")
     found = []
     for number in np.unique(frame):
         lines: list[Line | None] = []
