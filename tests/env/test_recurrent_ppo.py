@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from endopilot.ladder.submission import read_submission
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
 
 
@@ -63,3 +65,11 @@ def test_a_policy_without_tasks_is_not_saved(learner, monkeypatch, capsys, tmp_p
     with pytest.raises(SystemExit) as ended:
         learner["main"]()
     assert ended.value.code == 2 and "--output: " in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_scores_of_tasks_add_up():
+    rows = runpy.run_path(str(EXAMPLE.parents[1] / "docs" / "figures" / "unlearned.py"))["rows"]
+    driven = read_submission(EXAMPLE.parents[1] / "submissions" / "recurrent.json")
+    found = [(one.success and one.safe, one.success, 1) for done in driven.navigations.values() for one in done]
+    name, counted, *_ = rows(driven)[-1]
+    assert name == "all 8" and counted == "{:d} ({:d}) of {}".format(*np.sum(found, axis=0))
