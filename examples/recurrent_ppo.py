@@ -3,19 +3,21 @@
     pip install -c constraints.txt -e '.[env,learn]'
     python examples/recurrent_ppo.py --minutes 4
     python examples/recurrent_ppo.py --minutes 60 --tasks 8 --observation state --output state.npz
-    python examples/recurrent_ppo.py --score state.npz
+    python examples/recurrent_ppo.py --score state.npz --tasks 12
 
 Without `--tasks` it learns one task in one patient; with it the lowest tasks of the ladder, in 20 training patients
 each. With the observation `xray` seeing costs: between two exposures only encoders and loads of the drives are
 observed, and the policy decides by itself when to take one. So it has a memory, a GRU. The loop is that of CleanRL's
 `ppo_atari_lstm.py` (Huang et al., JMLR 23, 2022) with continuous actions. The run ends with an error if nothing was
-learned. `--score` lets the mean motions of a saved policy drive the ladder's own patients.
+learned. `--score` lets the mean motions of a saved policy drive the ladder's own patients, of the tasks that it has
+learned or of so many.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 import endopilot
-from endopilot.tasks.task import NEWEST, list_tasks, training_navigations
+from endopilot.tasks.task import NEWEST, Task, list_tasks, training_navigations
 
 PERIOD_S = 0.5
 """Time between two decisions, s, as on the ladder."""
@@ -193,19 +195,19 @@ def read(path: Path) -> tuple[dict[str, torch.Tensor], int, float]:
 
 
 @torch.no_grad()
-def score(path: Path) -> list[tuple[str, int, int, int, float]]:
-    """Let the mean motions of a saved policy drive the ladder's patients of the tasks that it was trained on.
+def score(path: Path, tasks: Sequence[Task]) -> list[tuple[str, int, int, int, float]]:
+    """Let the mean motions of a saved policy drive the ladder's patients of tasks.
 
     Returns:
         For each task its name, safe successes, successes, navigations, and mean exposures (0 where all is observed).
     """
     torch.manual_seed(0)
-    saved, tasks, period_s = read(path)
+    saved, _, period_s = read(path)
     actions = len(saved["log_std"])
     agent, scores = Agent(saved["encoder.0.weight"].shape[1], actions), []
     agent.load_state_dict(saved, strict=False)
     observation = "xray" if actions == 3 else "state"
-    for task in list_tasks()[:tasks]:
+    for task in tasks:
         given = [task.ladder_navigation(place) for place in range(len(task.ladder.numbers))]
         worlds = _worlds(len(given), observation, period_s, navigations=given)
         seen, begun = torch.as_tensor(worlds.reset(seed=0)[0]), torch.ones(len(given))
@@ -254,12 +256,14 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="go on from a policy that was written before")
     parser.add_argument("--dearer", type=float, default=0.0, help="what an exposure costs besides the reward's 0.05")
     parser.add_argument("--score", type=Path)
+    parser.add_argument("--version", default=NEWEST, help="folder of tasks to score in (examples/steve_tasks.py)")
     asked = parser.parse_args()
     if asked.output and not asked.tasks:
         parser.error("--output: what learned one task in one patient has no tasks to be scored on; give --tasks too")
     torch.set_num_threads(1)
     if asked.score:
-        for name, safe, success, count, exposures in score(asked.score):
+        tasks = list_tasks(asked.version)[: asked.tasks or read(asked.score)[1]]
+        for name, safe, success, count, exposures in score(asked.score, tasks):
             print(f"{name}: safe success {safe} of {count}, success {success}, exposures {exposures:.1f}", flush=True)
         return
     if asked.output:

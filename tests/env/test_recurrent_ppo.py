@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from endopilot.ladder.submission import read_submission
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
 
 
@@ -48,12 +50,12 @@ def test_it_trains_and_goes_on(learner, worlds, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "looks"), [("state", False), ("recurrent", True)])
-def test_saved_policies_are_scored_again(learner, ahead, monkeypatch, name, looks):
+def test_saved_policies_are_scored_again(learner, ahead, name, looks):
     """They find a target straight ahead, each in its own way: by the true state, or by exposures that they ask for."""
     ahead = replace(ahead, seconds=20.0)
     task = SimpleNamespace(name="ahead", ladder=SimpleNamespace(numbers=(0, 1)), ladder_navigation=lambda _: ahead)
-    monkeypatch.setitem(learner["score"].__wrapped__.__globals__, "list_tasks", lambda: (task,))
-    ((said, safe, success, count, exposures),) = learner["score"](EXAMPLE.parent / "policies" / f"{name}.npz")
+    path = EXAMPLE.parent / "policies" / f"{name}.npz"
+    ((said, safe, success, count, exposures),) = learner["score"](path, [task])
     assert (said, count) == ("ahead", 2) and 0 < safe <= success <= 2
     assert (exposures > 1) == looks and (exposures == 0) != looks
 
@@ -63,3 +65,11 @@ def test_a_policy_without_tasks_is_not_saved(learner, monkeypatch, capsys, tmp_p
     with pytest.raises(SystemExit) as ended:
         learner["main"]()
     assert ended.value.code == 2 and "--output: " in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_scores_of_tasks_add_up():
+    rows = runpy.run_path(str(EXAMPLE.parents[1] / "docs" / "figures" / "unlearned.py"))["rows"]
+    driven = read_submission(EXAMPLE.parents[1] / "submissions" / "recurrent.json")
+    found = [(one.success and one.safe, one.success, 1) for done in driven.navigations.values() for one in done]
+    name, counted, *_ = rows(driven)[-1]
+    assert name == "all 8" and counted == "{:d} ({:d}) of {}".format(*np.sum(found, axis=0))

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.files import read_json, write_json
+from endopilot.ladder.ladder import LadderConfig, terms_of
 from endopilot.ladder.scores import interval, score, submitted
 from endopilot.ladder.submission import KERNELS, NavigationEntry, Submission, read_submission
 from endopilot.tasks.task import list_tasks
@@ -85,3 +86,15 @@ def test_the_shortest_first_navigation_is_confirmed(path, checked):
 def test_an_interval_is_wilsons():
     assert interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # his paper's formula by hand
     assert interval(0, 20)[0] == 0.0 and interval(20, 20)[1] == pytest.approx(1.0)
+
+
+def test_realities_differ_and_are_scored_in_the_same_patients():
+    realities = runpy.run_path(str(ROOT / "docs" / "figures" / "realities.py"))
+    keys = [terms_of(LadderConfig(**terms)).key() for terms in ({}, *realities["REALITIES"].values())]
+    assert [keys.index(key) for key in keys] == [0, 1, 2, 3]
+    driven = read_submission(ROOT / "submissions" / "cloned.json")  # of more patients and fewer tasks than others
+    first = [one for done in driven.navigations.values() for one in done[: realities["PATIENTS"]]]
+    safe = sum(one.success and one.safe for one in first)
+    lower, upper, exposures, *_ = realities["cells"](driven)
+    assert lower.startswith(f"{safe} of {len(first)} (") and upper == "–"
+    assert float(exposures) == pytest.approx(sum(one.exposures for one in first) / len(first), abs=0.05)
