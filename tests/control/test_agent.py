@@ -111,6 +111,15 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(policy) -> None:
     assert policy.plans == 2  # found again, it searches another path
 
 
+def test_devices_rest_for_three_seconds_while_an_explanation_is_sought_and_are_then_pulled_back(side_branch) -> None:
+    policy = AgentPolicy(replace(QUICK, decision_evaluations=1))  # none is found
+    policy.start(side_branch, 0)
+    far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
+    done = [policy.decide(Observation(0.5 * k, ((6.0, 0.0),), far if k == 1 else None)) for k in range(9)][1:]
+    assert [each.devices[0][0] < 0 for each in done] == [each.expose for each in done] == [*[False] * 6, True, True]
+    assert policy.monitor.thinks and not any(each.gives_up for each in done)
+
+
 def test_a_wire_that_is_lost_again_and_again_ends_with_the_cause(policy) -> None:
     said = ""
     policy.monitor.changes_left = 0  # nothing else is sought
