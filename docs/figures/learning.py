@@ -61,9 +61,11 @@ def driven(data: Dataset, engine: str, *, as_given: bool = False) -> Dataset:
         of = data[k].set_up()
         stack = data.stack if as_given else of.stacks[0]
         friction = stack.frictions(np.full(1, stack.wire.friction)) if as_given else of.friction
-        simulator = ENGINES[engine](of.anatomies, [stack], config=of.config)
-        simulator.reset(inserted_length=of.initial[..., 0], rotation=of.initial[..., 1], friction=friction)
-        tips.append(simulator.run(data[k].command, period_s=data.sample_period_s).tip)
+        command, start = data[k].command, of.initial
+        reach_mm = float(start[..., 0].max() + np.maximum(command[..., 0], 0.0).sum(axis=1).max() * data.sample_period_s)
+        simulator = ENGINES[engine](of.anatomies, [stack], config=of.config, reach_mm=reach_mm)
+        simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1], friction=friction)
+        tips.append(simulator.run(command, period_s=data.sample_period_s).tip)
     return replace(
         data,
         tip_abscissa=np.concatenate([tip.abscissa for tip in tips]),
