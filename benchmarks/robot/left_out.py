@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.figures import fill, markdown_table
+from benchmarks.figures import fill
 from benchmarks.robot.paper_pair import States, predict_left_out
 from benchmarks.robot.twist import Sides, correlation, passages
 from endopilot.anatomy.io import read_anatomy
@@ -170,10 +170,7 @@ def bench_left_out(
 
     setting = patient, known, wire, episodes, epochs
     if teachers:
-        rows = [{"sessions that teach": count} | _learned(taught(read, count, *setting)) for count in teachers]
-        if write:
-            fill("evidence/reality.md", "curve", markdown_table(rows[0], (row.values() for row in rows)))
-        return rows
+        return [{"sessions that teach": count} | _learned(taught(read, count, *setting)) for count in teachers]
     everything = taught(read, len(read) - 1, *setting)
     of = {log.name: [one for one in everything if one.states.session == log.name] for log in read}
     tables = []

@@ -62,7 +62,8 @@ def driven(data: Dataset, engine: str, *, as_given: bool = False) -> Dataset:
         stack = data.stack if as_given else of.stacks[0]
         friction = stack.frictions(np.full(1, stack.wire.friction)) if as_given else of.friction
         command, start = data[k].command, of.initial
-        reach_mm = float(start[..., 0].max() + np.maximum(command[..., 0], 0.0).sum(axis=1).max() * data.sample_period_s)
+        pushed_mm = np.maximum(command[..., 0], 0.0).sum() * data.sample_period_s
+        reach_mm = float(start[..., 0].max() + pushed_mm)
         simulator = ENGINES[engine](of.anatomies, [stack], config=of.config, reach_mm=reach_mm)
         simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1], friction=friction)
         tips.append(simulator.run(command, period_s=data.sample_period_s).tip)
