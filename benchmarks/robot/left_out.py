@@ -121,9 +121,8 @@ def taught(
     """Return the episodes of each session, predicted by what the next so many others in order teach."""
     found, teachers = list[LeftOut](), dict[str, list[str]]()
     for k, log in enumerate(logs):
-        others = [logs[(k + 1 + more) % len(logs)] for more in range(count)]
-        robot = calibrated(others, anatomy, known, episodes)
-        teachers[log.name] = [each.name for each in others]
+        teachers[log.name] = [logs[(k + 1 + more) % len(logs)].name for more in range(count)]
+        robot = calibrated([each for each in logs if each.name in teachers[log.name]], anatomy, known, episodes)
         found += predicted(prepare(usable_episodes([log], anatomy), anatomy, 0.5, known), robot, wire)
     pairs = predict_left_out([each.states for each in found], teachers, epochs=epochs)
     for one, made in zip(found, pairs, strict=True):
