@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.figures import fill
+from benchmarks.figures import fill, markdown_table
 from benchmarks.robot.paper_pair import States, predict_left_out
 from benchmarks.robot.twist import Sides, correlation, passages
 from endopilot.anatomy.io import read_anatomy
@@ -154,7 +154,7 @@ def bench_left_out(
         sessions: parts of the names of the logs to take.
         epochs: that the paper's forward network is trained for.
         teachers: numbers of other sessions that teach, the next ones in order, for a learning curve, in place of all.
-        write: write the tables of docs/evidence/reality.md.
+        write: write the tables of docs/evidence/reality.md, or that of the learning curve.
 
     Returns:
         A row for each session and model, and for all sessions.
@@ -169,7 +169,10 @@ def bench_left_out(
 
     setting = patient, known, wire, episodes, epochs
     if teachers:
-        return [{"sessions that teach": count} | _learned(taught(read, count, *setting)) for count in teachers]
+        curve = [{"sessions that teach": str(count)} | _learned(taught(read, count, *setting)) for count in teachers]
+        if write:
+            fill("evidence/reality.md", "learning-curve", markdown_table(curve[0], (each.values() for each in curve)))
+        return curve
     everything = taught(read, len(read) - 1, *setting)
     of = {log.name: [one for one in everything if one.states.session == log.name] for log in read}
     tables = []
