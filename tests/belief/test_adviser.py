@@ -10,6 +10,7 @@ import pytest
 from endopilot.belief.bands import (
     AdviserConfig,
     Calibration,
+    Members,
     Predicted,
     conformal_scale,
     fit_spread,
@@ -135,8 +136,11 @@ def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
 
 def predicted(offset_mm: float = 0.0, *, inserted_mm: float = 0.0, radius_mm: float = 1.2) -> Predicted:
     """Return what a model predicts of a tip that follows the wire; one of 0.2 mm radius has a clearance of 1 mm."""
-    ends = np.array([[inserted_mm, 0.0], [inserted_mm, offset_mm]])
-    return Predicted(ends[0], ends[1], np.zeros(2), radius_mm)
+    return at(inserted_mm, inserted_mm, radius_mm, offset_mm)
+
+
+def at(inserted_mm: float, abscissa_mm: float, radius_mm: float = 2.0, offset_mm: float = 0.0) -> Predicted:
+    return Predicted(np.array([inserted_mm, 0.0]), np.array([abscissa_mm, offset_mm]), np.zeros(2), radius_mm)
 
 
 def adviser_at(at: Predicted, config: AdviserConfig | None = None, **bands: float) -> Watch:
@@ -212,11 +216,31 @@ def test_where_a_model_is_taken_to_be_wrong_each_image_tests_it() -> None:
     assert [asks(adviser, predicted()) for _ in range(6)] == [False, False, True] * 2
 
 
+def simulated(*weight: float, apart_mm: float = 0.0, pressed: float = 0.0, offset_mm: float = 0.0) -> Predicted:
+    """Return what two wires predict: the second lies so far from the first and off the centerline, and is pressed."""
+    second, at = np.array([0.0, 1.0]), predicted()
+    return at._replace(
+        simulated=Members(np.array(weight), apart_mm * second, offset_mm * second, np.full(2, 1.2), pressed * second)
+    )
+
+
 def test_an_exposure_is_due_where_the_wall_begins_to_press() -> None:
-    adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0)
-    share = (0.5, 0.7, 0.85, 0.9, 0.7, 0.7, 0.9, 0.9, 1.1, 1.2, 1.3, 1.3, 0.7)  # of what it may press with, ±20 %
-    due = [asks(adviser, predicted(), pressed=each) for each in share]
-    assert np.flatnonzero(due).tolist() == [2, 6, 8, 10]  # either end of the band reaches the limit, and its middle
+    """How likely a force is beyond the limit is Φ(ln(share)/0.2): 0.04, 0.21, 0.30, 0.68, 0.82 and 0.91 at shares of
+    0.7, 0.85, 0.9, 1.1, 1.2 and 1.3. An exposure is due where that has grown by 0.2 since one, or since it was less."""
+    share = (0.5, 0.7, 0.85, 0.9, 0.7, 0.7, 0.9, 0.9, 1.1, 1.2, 1.3, 1.3, 0.7)
+    for harder, weight, onset in ((1.0, 1.0, 0.2), (1.25, 1.0, 0.2), (1.0, 0.5, 0.1)):
+        adviser = adviser_at(predicted(), abscissa=0.0, offset=0.0, onset=onset)
+        due = [asks(adviser, simulated(1 - weight, weight, pressed=s / harder), harder=harder) for s in share]
+        assert np.flatnonzero(due).tolist() == [2, 6, 8, 10]
+        assert adviser.reason == "the tip may be reaching the wall"
+
+
+def test_an_exposure_is_due_where_likely_wires_lie_elsewhere_or_at_the_wall() -> None:
+    for where in ({"apart_mm": 6.0}, {"offset_mm": 0.95}):
+        for weight, due in ((0.25, True), (0.15, False)):
+            adviser = adviser_at(predicted(), AdviserConfig(abscissa_mm=5.0), abscissa=0.1, offset=0.1, onset=0.2)
+            asked = [asks(adviser, simulated(1.0, 0.0)), asks(adviser, simulated(1 - weight, weight, **where))]
+            assert asked == [False, due], (where, weight)
 
 
 def test_a_wire_that_rests_is_looked_at_once() -> None:
@@ -237,10 +261,6 @@ def test_an_exposure_is_due_after_as_long_as_was_calibrated_on() -> None:
     adviser = Watch(bands, AdviserConfig(), 0.2, predicted(), alone=False)
     due = [asks(adviser, predicted()) for _ in range(20)]
     assert [i for i, each in enumerate(due, 1) if each] == [8, 16]  # periods of 0.5 s
-
-
-def at(inserted_mm: float, abscissa_mm: float, radius_mm: float = 2.0) -> Predicted:
-    return Predicted(np.array([inserted_mm, 0.0]), np.array([abscissa_mm, 0.0]), np.zeros(2), radius_mm)
 
 
 def watch(inserted_mm: float = 0.0, *, alone: bool = True) -> Watch:

@@ -45,6 +45,21 @@ class AdviserConfig:
     """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must use."""
 
 
+class Members(NamedTuple):
+    """What each of some simulated wires predicts."""
+
+    weight: Float[np.ndarray, "members"]
+    """How likely each is, in the sum 1."""
+    apart_mm: Float[np.ndarray, "members"]
+    """How far along the vessel its tip is from the predicted one, mm, by way of the fork between the two."""
+    offset_mm: Float[np.ndarray, "members"]
+    """Its γtip, mm."""
+    radius_mm: Float[np.ndarray, "members"]
+    """Of the lumen there."""
+    pressed: Float[np.ndarray, "members"]
+    """With what share of the largest force that is allowed the wall presses on it."""
+
+
 class Predicted(NamedTuple):
     """What a model predicts of one tip."""
 
@@ -56,6 +71,16 @@ class Predicted(NamedTuple):
     """The model's estimate of its own error of these, a standard deviation, mm."""
     radius_mm: float
     """Of the lumen at that Δtip."""
+    simulated: Members | None = None
+    """What simulated wires predict each; None of a model that predicts this tip alone."""
+
+    @property
+    def members(self) -> Members:
+        """What each of the simulated wires predicts: this tip, which nothing presses, where there are none."""
+        if self.simulated is not None:
+            return self.simulated
+        one, none = np.ones(1), np.zeros(1)
+        return Members(one, none, self.tip[1:], one * self.radius_mm, none)
 
 
 @settings

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from endopilot.belief.bands import AdviserConfig, Calibration, Predicted
+from endopilot.belief.bands import AdviserConfig, Calibration, Members, Predicted
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import ahead_of_valve_n
+from endopilot.belief.events import astray_mm
 from endopilot.belief.identification import BETTER, Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import Event, State, States
@@ -227,8 +228,8 @@ class Monitor:
         if self.seen is not None:
             watch.exposed(float((at.tip + self.seen.less(at.tip))[1]), at)
         motion = _MOTION_SD_MM * (self.belief.motion is not None)
-        pressed = self.load_ratio * float(self.belief.force[self.belief.best]) / self._navigation.force_limit_n
-        due = not self.rests and watch.advise(at, self.belief.play_spread() ** 2 + motion**2, pressed=pressed)
+        beside_mm2 = self.belief.play_spread() ** 2 + motion**2
+        due = not self.rests and watch.advise(at, beside_mm2, harder=self.load_ratio)
         return self._believed(watch, at.tip, due)
 
     def _see(self, exposure: TipMeasurement, period: int, at: Predicted) -> None:
@@ -352,6 +353,14 @@ class Monitor:
 
 def predicted_tip(belief: Belief) -> Predicted:
     """Return what a belief predicts of the tip: that of the likeliest wire, and the spread of all wires."""
-    best, tip = belief.best, belief.likeliest_tip()
-    ends = np.array([tip.abscissa[0], tip.offset[0]])
-    return Predicted(belief.simulator.proximal[best, 0], ends, belief.tip_spread(), float(tip.radius[0]))
+    best, tip, tree = belief.best, belief.tip, belief.navigation.anatomy.tree
+    likeliest = np.full(len(tip.branch), tip.branch[best]), np.full(len(tip.branch), tip.abscissa[best])
+    apart_mm = astray_mm(tree, likeliest, (tip.branch, tip.abscissa))
+    pressed = belief.force / belief.navigation.force_limit_n
+    return Predicted(
+        belief.simulator.proximal[best, 0],
+        np.array([tip.abscissa[best], tip.offset[best]]),
+        belief.tip_spread(),
+        float(tip.radius[best]),
+        Members(belief.weight, apart_mm, tip.offset, tip.radius, pressed),
+    )

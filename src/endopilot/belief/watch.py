@@ -112,9 +112,8 @@ _STILL_MM = 0.1
 """Where neither tip nor proximal end has moved by more since an exposure, mm, another shows the same."""
 _SOFT_MM = 0.03
 """Added to the standard deviation of how far a tip is from τ, mm: the lumen's radius is read off a smoothed line."""
-_PRESSES = np.array([0.8, 1.0, 1.25])
-"""Shares of the largest force that the wall may press with, by simulated wires and the drive's load, at which it is
-looked at: both ends of the band, for they err by a fifth, as wires do, and its middle."""
+_FORCE_SD = 0.2
+"""Standard deviation of the logarithm of a simulated wire's force: it errs by a fifth, as wires do."""
 MISMATCH = "model mismatch"
 """Why X-ray is asked for while the model is taken to be wrong."""
 
@@ -150,9 +149,9 @@ class Watch:
         self._calibration, self._config, self._tip_radius_mm = calibration, config, tip_radius_mm
         self._inserted_mm, self._travel_mm, self._periods = float(at.proximal[0]), 0.0, 0
         self._ends_mm, self._width_mm, self.held_mm = np.array([at.proximal[0], *at.tip]), 0.0, 0.0
-        self._moved_mm, self._wide, self._late, self._presses = 0.0, False, False, 0
+        self._moved_mm, self._astray, self._late, self._pressed, self._presses = 0.0, False, False, 0.0, False
         self.half_width = self._half = self._widths(at.spread, np.zeros(2))
-        self._at_wall = float(ndtr(-self._from_wall(at)))
+        self._at_wall = self._contact(at)
 
     def move(self, at: Predicted) -> None:
         """Take what is predicted a period later."""
@@ -169,21 +168,22 @@ class Watch:
     def exposed(self, offset_mm: float, at: Predicted) -> None:
         """Begin anew at an exposure that shows γtip, mm, with what the model then predicts."""
         self._periods, self._travel_mm, self.held_mm, self._moved_mm = 0, 0.0, 0.0, 0.0
-        self._at_wall = float(self._ratio(offset_mm, at.radius_mm) >= self._config.wall_ratio)
+        shown = safety_ratio(np.array([offset_mm]), np.array([at.radius_mm]), self._tip_radius_mm)
+        self._at_wall = float(shown[0] >= self._config.wall_ratio)
 
     def advise(
         self,
         at: Predicted,
         variance_mm2: Float[np.ndarray, "2"] | float = 0.0,
         *,
-        pressed: float = 0.0,
+        harder: float = 1.0,
     ) -> bool:
         """Return whether an exposure is due, once a period.
 
         Args:
             at: what is predicted for now, after the exposure if there was one.
             variance_mm2: of (Δtip, γtip), which the calibration does not know of, mm².
-            pressed: force of the wall as a share of what it may be.
+            harder: how much harder the drive pushes than is predicted: walls press on simulated wires by as much more.
         """
         inserted_mm, factor = float(at.proximal[0]), self.innovations.factor
         self._periods, self._travel_mm = self._periods + 1, self._travel_mm + abs(inserted_mm - self._inserted_mm)
@@ -191,28 +191,32 @@ class Watch:
         half = factor * self._widths(at.spread, np.sqrt(variance_mm2 + self.sd_mm**2))
         self.half_width = np.array([half[0], np.hypot(half[1], self.wall_mm(at.radius_mm))])
         self._half = self.half_width / factor
-        self._wide = bool(2 * ndtr(-self._config.abscissa_mm * _WITHIN / max(half[0], 1e-9)) >= self._calibration.onset)
+        onset, members = self._calibration.onset, at.members
+        to_either_side = np.multiply.outer((1.0, -1.0), members.apart_mm) - self._config.abscissa_mm
+        astray = ndtr(to_either_side * _WITHIN / max(half[0], 1e-9)).sum(axis=0)
+        self._astray = float(members.weight @ astray) >= onset
         self._late = self._periods * DECISION_PERIOD_S >= self._calibration.longest_s
-        self._presses, pressed_before = int((pressed >= _PRESSES).sum()), self._presses
+        pressed = float(members.weight @ ndtr(np.log(np.maximum(harder * members.pressed, 1e-9)) / _FORCE_SD))
+        self._presses = pressed - self._pressed >= onset
         comes = 0.0
         if self._periods > 1:  # else X-ray shows it
-            before, self._at_wall = self._at_wall, float(ndtr(-self._from_wall(at)))
+            before, self._at_wall = self._at_wall, self._contact(at)
             comes = self._at_wall * (1 - before)
-        due = comes >= self._calibration.onset or self._wide or self._late or self._presses > pressed_before
+        due = comes >= onset or self._astray or self._late or self._presses
         due = due or (self.innovations.alarm and self._periods >= _ALWAYS)
         due = due and self._periods > 1 and self._moved_mm > _STILL_MM
         if due:
             self._periods, self._travel_mm = 0, 0.0
+        self._pressed = pressed if due else min(self._pressed, pressed)
         return due
 
-    def _from_wall(self, at: Predicted) -> float:
-        """Return how many standard deviations the tip is from where it counts as at the wall; less than 0 beyond."""
-        missing = self._config.wall_ratio - self._ratio(float(at.tip[1]), at.radius_mm)
-        clearance_mm = max(at.radius_mm - self._tip_radius_mm, 1e-9)
-        return missing * clearance_mm / (float(self.half_width[1]) / _WITHIN + _SOFT_MM)
-
-    def _ratio(self, offset_mm: float, radius_mm: float) -> float:
-        return float(safety_ratio(np.array([offset_mm]), np.array([radius_mm]), self._tip_radius_mm)[0])
+    def _contact(self, at: Predicted) -> float:
+        """Return how likely the tip is at the wall."""
+        members = at.members
+        missing = self._config.wall_ratio - safety_ratio(members.offset_mm, members.radius_mm, self._tip_radius_mm)
+        clearance_mm = np.maximum(members.radius_mm - self._tip_radius_mm, 1e-9)
+        away = missing * clearance_mm / (float(self.half_width[1]) / _WITHIN + _SOFT_MM)
+        return float(members.weight @ ndtr(-away))
 
     def _widths(self, spread: Float[np.ndarray, "2"], beside_mm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """Return the half-widths of the bands for a spread and for standard deviations beside it, mm."""
@@ -238,6 +242,6 @@ class Watch:
             return MISMATCH
         if self._late:
             return "the last exposure is long ago"
-        if self._wide:
+        if self._astray:
             return f"Δtip is known to ±{self.half_width[0]:.1f} mm only"
         return "the wall presses hard" if self._presses else "the tip may be reaching the wall"
