@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from endopilot.belief.drives import ahead_of_valve_n
-from endopilot.belief.identification import Identified
 from endopilot.belief.monitor import BelievedTip, LoadRatio, Monitor
-from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.thought import Pace
 from endopilot.belief.watch import ASSUMED_SD_MM, MISMATCH, Innovations
 from endopilot.control.agent_config import read_agent_calibration
@@ -24,7 +22,6 @@ from endopilot.simulation.world import World
 from endopilot.tasks.navigation import Navigation, Target
 
 HALF_MM = np.array([0.8, 0.2])
-NOTHING = Identified(interval={}, wall="unknown", explains=True, words="")
 
 
 class ToAndFro:
@@ -120,8 +117,6 @@ def test_identification_goes_on_over_decisions_and_its_belief_follows_what_came_
     assert deep_mm == pytest.approx(past.proximal[-1][0, 0], abs=0.05)
     assert max(past.exposures) < len(past.proximal) - 1  # what was seen last is some periods ago
     assert policy.monitor.seen is None  # that is not where the tip is now
-    policy.monitor.return_to_given()
-    assert policy.monitor.belief.members[0].registration_mm == (0.0, 0.0, 0.0) and policy.monitor.seen is None
 
 
 def test_a_wrong_registration_is_noticed_and_taken_off_what_x_ray_shows(along_the_fork) -> None:
@@ -168,9 +163,6 @@ def test_a_vessel_that_moves_is_noticed_and_its_motion_identified(along_the_fork
     assert found.breathing_period_s == pytest.approx(4.4, rel=0.05)
     assert found.breathing_caudal_mm == pytest.approx(6.0, abs=1.5)
     assert len(held) > 12 and np.mean(held) > 0.85
-    policy.monitor.identified = NOTHING
-    policy.monitor.return_to_given()
-    assert policy.monitor.moves.motion == policy.monitor.belief.motion == found  # the exposures still tell of it
 
 
 def test_amplitudes_that_differ_from_the_known_motion_are_identified(along_the_fork) -> None:
@@ -184,17 +176,6 @@ def test_amplitudes_that_differ_from_the_known_motion_are_identified(along_the_f
     assert found.breathing_caudal_mm == pytest.approx(10.0, abs=1.5)
     assert not policy.monitor.lost
     assert policy.last.abscissa == pytest.approx(at, abs=1.0)
-
-
-def test_a_motion_that_was_found_wrongly_is_given_up_with_what_was_identified(along_the_fork) -> None:
-    *_, (policy, _) = driven(replace(along_the_fork, seconds=7.0), World(), kind=Rocks)
-    monitor, wrong = policy.monitor, Motion(heart_period_s=0.8, annulus_mm=9.0)
-    monitor.belief = monitor.belief.like(monitor.belief.members, motion=wrong)
-    monitor.belief.replay(monitor.past)
-    monitor.moves, monitor.identified = FoundMotion(wrong, gain=10.0, misfit=0.1), NOTHING
-    monitor.return_to_given()
-    assert monitor.moves is None and monitor.belief.motion is None and monitor.belief.navigation.known_motion is None
-    assert not monitor.may_return
 
 
 def innovations(random: np.random.Generator, off: np.ndarray, sd: np.ndarray, count: int) -> Innovations:

@@ -22,7 +22,7 @@ from endopilot.models.hypotheses import HEART, HYPOTHESES, LUMEN, Family, Poster
 from endopilot.simulation.world import World
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
-BETTER = 3.0
+_BETTER = 3.0
 """What is found must explain all exposures better by this logarithm."""
 _LEAST_GAIN, _MOST_MISFIT = 6.0, 0.8
 """A motion is believed that makes the exposures likelier by this logarithm, and leaves no larger misfit."""
@@ -255,7 +255,7 @@ def _moved(
             return None
         tried = belief.like(members, motion=found.motion, drives=drives)
         tried.replay(past)
-    if tried.evidence < belief.evidence + BETTER:
+    if tried.evidence < belief.evidence + _BETTER:
         return None
     if own:
         drives.begin(past.measured[-1][0])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from endopilot.belief.bands import AdviserConfig, Calibration, Members, Predicte
 from endopilot.belief.belief import Belief, BeliefConfig, Past
 from endopilot.belief.drives import ahead_of_valve_n
 from endopilot.belief.events import astray_mm
-from endopilot.belief.identification import BETTER, Explanation, Identified, explain
+from endopilot.belief.identification import Explanation, Identified, explain
 from endopilot.belief.patient_motion import FoundMotion
 from endopilot.belief.states import Event, State, States
 from endopilot.belief.thought import Budget, Pace, Thought
@@ -149,7 +149,7 @@ class Monitor:
         self.moves: FoundMotion | None = None
         self.seen: TipMeasurement | None = None
         self._tests, self._loads = calibration is not None and not navigation.catheters, LoadRatio()
-        self.changes_left, self._since, self._returned = _MOST, 0, False
+        self.changes_left, self._since = _MOST, 0
         self._pace, self._thought, self._settles, self._alarmed = pace or Pace(), None, settles, False
         self._watch, self._innovations = None, Innovations()
         if calibration is not None:
@@ -277,32 +277,8 @@ class Monitor:
         self.belief, self.identified, self.moves = found.belief, found.identified, found.moves
         self._renew()
         if rested or self.seen is not None:  # they lie where they were seen
-            self.seen = self._last_seen()
-
-    @property
-    def may_return(self) -> bool:
-        """Whether what was identified may be given up for what is given, which is done once."""
-        return self.identified is not None and not self._returned
-
-    def return_to_given(self) -> None:
-        """Take wire, lumen and wall as they are given again, with the ostium that was identified, if that may be.
-
-        A motion that was found is given up too, unless all exposures are still likelier with it.
-        """
-        if self.may_return:
-            deeper_mm = self.belief.mean_ostium_mm
-            given = [replace(each, ostium_mm=each.ostium_mm + deeper_mm) for each in Belief.around(self._config)]
-            tried = [self.belief.like(given, motion=None)]
-            if self.moves is not None:
-                tried.append(self.belief.like(given))
-            for each in tried:
-                each.replay(self.past)
-            still, found = tried[0], tried[-1]
-            if found.evidence < still.evidence + BETTER:
-                found, self.moves = still, None
-            self.belief, self._returned = found, True
-            if self.seen is not None:
-                self.seen = self._last_seen()
+            period, seen = list(self.past.exposures.items())[-1]
+            self.seen = self.belief.in_vessel(seen, period)
 
     def _is_to_change(self) -> bool:
         """Return whether another belief is sought: the first does not explain the images, or no longer the last one."""
@@ -315,11 +291,6 @@ class Monitor:
         """Begin with another belief."""
         self._since, self._loads = 0, LoadRatio()
         self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
-
-    def _last_seen(self) -> TipMeasurement:
-        """Return the last exposure, which may be some periods ago, as it is in the vessel that is believed now."""
-        period, seen = list(self.past.exposures.items())[-1]
-        return self.belief.in_vessel(seen, period)
 
     def _may_move(self) -> bool:
         """Return whether a motion of the vessel may explain the exposures."""

@@ -90,7 +90,6 @@ class _PlanningPolicy:
         wanted = self._pull_back() if lost else self._go_on(observation)
         self.belief.drives.sent(wanted)
         ends = self._failed >= self.config.tries and self._follower.course is None and not lost
-        ends = ends and not self.monitor.may_return
         expose = not self.monitor.rests and (self._back_far_enough() if lost else self.wants_xray())
         return Decision(wanted, expose=expose, gives_up=self.halt if ends else "")
 
@@ -137,8 +136,6 @@ class _PlanningPolicy:
     def _observe(self, observation: Observation) -> None:
         monitor, before = self.monitor, self.monitor.lost
         self._believed = monitor.step(observation.devices, observation.load, self._shown(observation))
-        if self._failed >= self.config.tries:  # what was identified leads nowhere
-            monitor.return_to_given()
         if self.belief is not monitor.belief:  # another wire, lumen or ostium: another course
             self.belief = monitor.belief
             self._begin_anew()
