@@ -1,9 +1,8 @@
 """Compare what a search tries where a straight push fails: `python -m benchmarks agent-samplers [VERSION ...]`.
 
 Three samplers search courses for the same navigations, from the same beliefs, with the same budget of evaluations of
-nodes. `grid, onward`: places and rotations evenly, then drawn ones that go on where the best of the round before have
-led. `near the best`: drawn evenly, then around the best so far, each time from where the devices are (the cross-entropy
-method, with elites). `own`: the package's table.
+nodes. `grid`: places and rotations evenly. `near the best`: drawn evenly, then around the best so far, each time from
+where the devices are (the cross-entropy method, with elites). `own`: the package's table.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from endopilot.tasks.task import list_tasks
 
 COLUMNS = ("tasks", "sampler", "reached", "10⁶ evaluations: mean", "median", "largest")
 _GRID = Row(at=(-1.0,), turns=32), Row(turns=32), Row(turns=32, back=(1.5, 3.0))
-_ONWARD = Row(at=(-1.0,), turns=32, back=(0.0, 4.0), rounds=8, onward=True, agree=0.5)
 _NEAR = Row(at=(-4.0, 3.0), turns=32, back=(0.0, 4.0), rounds=12, agree=0.5)
 
 
@@ -44,7 +42,7 @@ def tables() -> dict[str, Table]:
         alone = {kind: of(each) for kind, each in own.items() if kind in ("wire", "wire in a wide lumen")}
         return {**own, **alone}
 
-    return {"grid, onward": changed(_GRID, (_ONWARD,)), "near the best": changed((), (_NEAR,)), "own": own}
+    return {"grid": changed(_GRID, ()), "near the best": changed((), (_NEAR,)), "own": own}
 
 
 def search(navigation: Navigation, table: Table, *, evaluations: int, seed: int) -> tuple[float, float]:

@@ -126,15 +126,6 @@ def test_a_row_combines_places_leads_and_rotations() -> None:
     assert set(made.follow_mm[made.lead_mm == -15.0]) == {-15.0} and (made.follow_mm[made.lead_mm == -3.0] > 100).all()
 
 
-def test_later_rounds_that_go_onward_are_drawn_anew_where_devices_are() -> None:
-    row, random = Row(at=(-1.0,), back=(0.0, 2.0), turns=64, rounds=2, onward=True), np.random.default_rng(1)
-    first = row.motions(20.0, 5.0, CONFIG, 1, random)
-    later = row.motions(20.0, 5.0, CONFIG, 1, random, first)
-    assert (first.at_mm == 15.0).all() and np.isnan(later.at_mm).all()
-    assert 0 <= later.back_mm.min() < 1.0 and 9.0 < later.back_mm.max() <= 10.0
-    assert later.turn_rad.min() < -2.0 and later.turn_rad.max() > 2.0
-
-
 def test_later_rounds_are_drawn_near_the_best_and_some_anew() -> None:
     row, random = Row(at=(-2.0, 2.0), back=(0.0, 2.0), turns=1000, rounds=2), np.random.default_rng(1)
     first = row.motions(20.0, 5.0, CONFIG, 1, random)
@@ -149,11 +140,10 @@ def test_later_rounds_are_drawn_near_the_best_and_some_anew() -> None:
     assert np.isnan(later.at_mm).mean() == pytest.approx(0.3 * 0.25, abs=0.03)
 
 
-def test_rounds_near_the_best_ask_for_fewer_wires_and_others_always_for_as_many() -> None:
+def test_each_round_asks_for_fewer_wires() -> None:
     near = Row(at=(-2.0, 2.0), rounds=5, agree=0.5)
     assert [near.agrees(number) for number in range(5)] == [1.0, 0.875, 0.75, 0.625, 0.5]
-    onward, once = Row(rounds=5, onward=True, agree=0.5), Row(agree=0.5)
-    assert onward.agrees(0) == onward.agrees(4) == once.agrees(0) == 0.5
+    assert Row(agree=0.5).agrees(0) == 0.5
     for each in read_table().values():
         for row in (*each.rows, *each.drawn):
             assert all(0 < row.agrees(number) <= 1 for number in range(row.rounds))

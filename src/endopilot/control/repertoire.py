@@ -67,7 +67,7 @@ class Row:
     """Motions that are tried at once: every place, lead and retraction with every rotation.
 
     Where there are several rounds they are drawn instead: evenly at first, then around the best so far. Where a value
-    is drawn, its first and last are the ends.
+    is drawn, its first and last are the ends. Drawn velocities go on where the best of the round before have led.
 
     A *step* is half the width of a branch's mouth: 1.4 lumen radii at the obstacle, `SearchConfig.lead_mm` at least.
     The *obstacle* is the fork before the place that is to be passed, or where the first row came to.
@@ -91,11 +91,9 @@ class Row:
     """Devices keep velocities that are drawn, as many as there are rotations; they are not turned before."""
     rounds: Annotated[int, Within(1, 1000)] = 1
     """Times that motions are tried."""
-    onward: bool = False
-    """Each round goes on where the best of the one before have led, instead of where the devices are."""
     agree: Share = 1.0
-    """Share of the wires, by weight, that is to pass the place; the others are no longer believed. Of motions that are
-    drawn near the best all have to pass in the first round, and this share in the last."""
+    """Share of the wires, by weight, that is to pass the place; the others are no longer believed. Of several rounds
+    all have to pass in the first, and this share in the last."""
     force: Share = 1.0
     """Share of the force limit that a motion which is taken stays within, at most."""
 
@@ -105,9 +103,14 @@ class Row:
         grid = len(self.at or (0,)) * len(self.lead_mm) * len(self.back) * max(len(self.follow_mm), 1)
         return self.turns * (grid if self.rounds == 1 else 1)
 
+    @property
+    def onward(self) -> bool:
+        """Whether each round goes on where the best of the one before have led, instead of where the devices are."""
+        return self.draws is not None and self.rounds > 1
+
     def agrees(self, number: int) -> float:
         """Return the share of the wires, by weight, that is to pass the place in a round, from 0 on."""
-        return self.agree if self.onward or self.rounds == 1 else 1 - (1 - self.agree) * number / (self.rounds - 1)
+        return self.agree if self.rounds == 1 else 1 - (1 - self.agree) * number / (self.rounds - 1)
 
     def motions(
         self,
@@ -142,9 +145,6 @@ class Row:
         """Return places, rotations and retractions that are drawn: evenly, and most of later rounds near the best."""
         count, ends = self.turns, np.array([(each[0], each[-1]) for each in (self.at or (np.nan,), self.back)])
         turn = random.uniform(-np.pi, np.pi, count)
-        if self.onward:
-            at, back = np.full(count, ends[0, 0] if best is None else np.nan), random.uniform(0.0, ends[1, 1], count)
-            return np.maximum(obstacle_mm + at * step_mm, 0.0), turn, back * step_mm
         drawn = ends[:, :1] + np.diff(ends) * random.random((2, count))
         stays = random.random((3, count)) < _AS_IS
         at = np.where(stays[0], np.nan, obstacle_mm + drawn[0] * step_mm)
