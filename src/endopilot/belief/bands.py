@@ -77,10 +77,8 @@ class Predicted(NamedTuple):
     @property
     def members(self) -> Members:
         """What each of the simulated wires predicts: this tip, which nothing presses, where there are none."""
-        if self.simulated is not None:
-            return self.simulated
         one, none = np.ones(1), np.zeros(1)
-        return Members(one, none, self.tip[1:], one * self.radius_mm, none)
+        return self.simulated or Members(one, none, self.tip[1:], one * self.radius_mm, none)
 
 
 @settings

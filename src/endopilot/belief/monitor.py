@@ -275,7 +275,8 @@ class Monitor:
             if len(found.past.proximal) == 1:
                 self._given = found.belief.members
         self.belief, self.identified, self.moves = found.belief, found.identified, found.moves
-        self._renew()
+        self._since, self._loads = 0, LoadRatio()
+        self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
         if rested or self.seen is not None:  # they lie where they were seen
             period, seen = list(self.past.exposures.items())[-1]
             self.seen = self.belief.in_vessel(seen, period)
@@ -286,11 +287,6 @@ class Monitor:
             return False
         first = self.identified is None and self.moves is None and not self.belief.drives.unknown
         return first or (self._since >= _EVERY and (not self.belief.explains or self._innovations.outside))
-
-    def _renew(self) -> None:
-        """Begin with another belief."""
-        self._since, self._loads = 0, LoadRatio()
-        self._innovations.renew(unknown=self.identified is not None and not self.identified.explains)
 
     def _may_move(self) -> bool:
         """Return whether a motion of the vessel may explain the exposures."""
