@@ -255,7 +255,7 @@ def test_a_course_is_searched_again_where_the_drive_pushes_harder_than_simulated
     """Walls press harder by as much as the drive pushes harder: a fourth of the limit leaves no way, as above."""
     policy = AgentPolicy(config=QUICK)
     policy.start(side_branch, seed=1)
-    limited = replace(side_branch, force_limit_n=float(policy.find_course(20.0).force.max()))
+    limited = replace(side_branch, force_limit_n=1.2 * float(policy.find_course(20.0).force.max()))
     policy.start(limited, seed=1)
 
     def decide(period: int) -> Decision:
