@@ -97,7 +97,7 @@ def measure(name: str, options: Sequence[str]) -> Any:
     """
     from endopilot.cli.options import Command  # slow to import
 
-    return Command(f"python -m benchmarks {name}", function_of(name)).answer(options)
+    return Command(f"python -m benchmarks {name}", function_of(name)).run(options, shown=False)
 
 
 def function_of(name: str) -> Callable[..., Any]:

@@ -49,8 +49,6 @@ def locate_command(
         page: HTML page of what was found.
         device: name of the wire (`endopilot devices`) or a YAML file, for images.
     """
-    if not seen:
-        raise InputError("seen: no file; give a cine (DICOM), PNG images or a CSV file of lines")
     vessel = read_anatomy(anatomy) if (anatomy / "anatomy.json").exists() else extract_anatomy(anatomy)
     find = _in_lines if seen[0].suffix.lower() == ".csv" else _in_images
     found, drawn, figures, said = find(vessel, seen, camera, device, config)

@@ -9,11 +9,8 @@ import contextlib
 import inspect
 import sys
 from collections.abc import Mapping
-from functools import reduce
-from operator import or_
 from pathlib import Path
-from types import GenericAlias
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 from typing_extensions import TypedDict
@@ -102,9 +99,9 @@ def _tool(folder: Path, name: str) -> Any:
 
     def tool(**given: Any) -> Any:
         try:
-            words = [word for key, value in given.items() for word in _words(folder, options[key], value)]
+            values = made.values({key: _inside(folder, options[key], value) for key, value in given.items()})
             with contextlib.redirect_stdout(sys.stderr):
-                answer = made.answer(words)
+                answer = made.call(values)
         except InputError as error:
             raise ToolError(str(error).replace(f"{folder}/", "")) from None
         figures = answer.figures if isinstance(answer, Answer) else answer
@@ -116,7 +113,7 @@ def _tool(folder: Path, name: str) -> Any:
             each.name,
             inspect.Parameter.KEYWORD_ONLY,
             default=inspect.Parameter.empty if each.required else each.value,
-            annotation=Annotated[_plain(each.kind), Field(description=each.meaning)],
+            annotation=Annotated[each.kind, Field(description=each.meaning)],
         )
         for each in options.values()
     ]
@@ -130,41 +127,21 @@ def _tool(folder: Path, name: str) -> Any:
     return served
 
 
-def _plain(kind: Any) -> Any:
-    """Return the type of an option as an assistant gives it: text for a path, a list of any number."""
-    if get_origin(kind) is Annotated:
-        return _plain(get_args(kind)[0])
-    if get_origin(kind) is tuple:
-        return GenericAlias(list, _plain(get_args(kind)[0])) if get_args(kind)[-1] is ... else kind
-    if get_args(kind) and get_origin(kind) is not Literal:
-        return reduce(or_, map(_plain, get_args(kind)))
-    return str if kind is Path else kind
-
-
-def _words(folder: Path, option: Option, value: Any) -> list[str]:
-    """Return an option as words of a command line; InputError as `_word` has it."""
-    if value is None:
-        return []
+def _inside(folder: Path, option: Option, value: Any) -> Any:
+    """Return an option's value, paths in the folder; InputError for a path out of it, by `..`, as an absolute one or by
+    a link, or for a name of code that is not the package's own."""
     if isinstance(value, list | tuple):
-        words = [_word(folder, option, each) for each in value]
-        return words if option.positional or not words else [option.flags[-1], *words]
-    word = _word(folder, option, value)
-    return [word] if option.positional else [f"{option.flags[-1]}={word}"]
-
-
-def _word(folder: Path, option: Option, value: Any) -> str:
-    """Return a value as a word of a command line; InputError for a path out of the folder, by `..`, as an absolute one
-    or by a link, or for a name of code that is not the package's own."""
+        return tuple(_inside(folder, option, each) for each in value)
     own = {"policy": POLICIES.shipped, "method": METHODS.shipped}.get(option.name)
     if own is not None and value not in own and value != option.value:
         raise InputError(f"{option.name}: {value!r}; choose from {', '.join(own)}")
     shipped = {"device": list_wires(), "catheter": list_catheters()}.get(option.name)
-    if "Path" in str(option.kind) or (shipped is not None and value not in shipped):
-        place = (folder / str(value)).resolve()
+    if isinstance(value, Path) or (value is not None and shipped is not None and value not in shipped):
+        place = (folder / value).resolve()
         if not place.is_relative_to(folder):
             raise InputError(f"{option.name}: {value} leads out of the folder of this server; give a path in it")
-        value = place
-    return str(value)
+        return type(value)(place)
+    return value
 
 
 def _answer(folder: Path, figures: Mapping[str, Any], answered: Mapping[str, Any]) -> dict[str, Any]:

@@ -157,26 +157,13 @@ class Command:
         for name, one in self._parameters.items():
             option, positional = tree[name], one.kind is one.POSITIONAL_ONLY
             if one.default is one.empty:
-                option = replace(option, kind=get_args(option.kind)[0], required=option.value is None)
+                option = replace(option, kind=get_args(option.kind)[0], required=option.value in (None, ()))
             tree[name] = replace(option, positional=positional)
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
-    def run(self, arguments: Sequence[str]) -> None:
-        """Do what the arguments ask for, and print what comes of it; InputError for bad arguments, or a bad file of
-        `--config`."""
-        values = self._asked(arguments)
-        if values is not None:
-            answer = self._called(values)
-            if self._answers:
-                show_answer(answer, as_json=values.json)
-
-    def answer(self, arguments: Sequence[str]) -> Any:
-        """Do what the arguments ask for, and return what comes of it; None where they ask for help."""
-        values = self._asked(arguments)
-        return None if values is None else self._called(values)
-
-    def _asked(self, arguments: Sequence[str]) -> Any:
-        """Return what the arguments set the options to; None where they ask for a text, which is printed."""
+    def run(self, arguments: Sequence[str], *, shown: bool = True) -> Any:
+        """Do what the arguments ask for, print what comes of it if that is to be `shown`, and return it; None where they
+        ask for a text. InputError for bad arguments, or a bad file of `--config`."""
         if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
             print(self.help(everything="--help-all" in arguments), end="")
             return None
@@ -184,10 +171,14 @@ class Command:
         if "--print-config" in arguments:
             print(self.file(values), end="")
             return None
-        return values
+        answer = self.call(values)
+        if shown and self._answers:
+            show_answer(answer, as_json=values.json)
+        return answer
 
-    def _called(self, values: Any) -> Any:
-        """Return what the function returns, once its inputs are there and nothing lies in the way of its outputs."""
+    def call(self, values: Any) -> Any:
+        """Return what the function returns for values of its options, an instance of `settings`, once its inputs are
+        there and nothing lies in the way of its outputs."""
         places: list[tuple[Place, Path]] = []
         for one in itertools.chain.from_iterable(option.leaves() for option in self.options(values)):
             for path in one.value if isinstance(one.value, tuple) else (one.value,):
@@ -211,11 +202,17 @@ class Command:
         given = self._given(arguments)
         file, incomplete = given.pop("--config", None), given.pop("--print-config", False)
         start = self.defaults if file is None else read_settings(Path(file), self.settings, onto=self.defaults)
-        missing = [one for one in self.options(start) if one.required and one.name not in given]
-        if missing and not incomplete:
-            called = ", ".join(f"{flag} {missing[0].takes}".rstrip() for flag in missing[0].flags)
-            _Parser(self.name).error(f"Missing from {self.name}: {called}")
-        return _with(start, given)
+        return self.values(given, onto=start, incomplete=incomplete)
+
+    def values(self, given: Mapping[str, Any], *, onto: Any = None, incomplete: bool = False) -> Any:
+        """Return the options set to what is given by their names, else to the values `onto`, or the defaults;
+        InputError for a bad value, or, unless it may be `incomplete`, for a missing one."""
+        onto = self.defaults if onto is None else onto
+        for one in () if incomplete else self.options(onto):
+            if one.required and given.get(one.name, ()) == ():
+                called = ", ".join(f"{flag} {one.takes}".rstrip() for flag in one.flags)
+                _Parser(self.name).error(f"Missing from {self.name}: {called}")
+        return _with(onto, given)
 
     def _given(self, arguments: Sequence[str]) -> dict[str, Any]:
         """Return what the arguments set, by name: what means nothing is text, which the settings refuse."""

@@ -92,8 +92,6 @@ def anatomy_command(
         picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
         ct: CT angiogram in HU, shown behind the walls in the picture.
     """
-    if not sources:
-        raise InputError("no file was given; name a mask, a surface or a centerline")
     check_outside(output, sources)
     if len(sources) > 1:
         for option, value in (("name", name), ("picture", picture), ("ct", ct)):
