@@ -132,20 +132,20 @@ Units are mm, N, s, rad and HU; world coordinates are LPS mm.
 defaults; `--help-all` lists all."""
 
 
-def _work(name: str, arguments: Sequence[str]) -> None:
+def _work(name: str, arguments: Sequence[str]) -> int:
     for word in arguments:
         if any("\ud800" <= letter <= "\udfff" for letter in word):  # so Python has bytes that are no UTF-8
             raise InputError(f"{word}: the name is not UTF-8; rename it, and give the new name")
     if name:
-        from endopilot.cli.process import check_memory_limit
+        from endopilot.cli.process import EXIT_FAILED, check_memory_limit
 
         check_memory_limit()
         command = command_of(name)
         if not gc.isenabled():
             gc.freeze()  # what is imported stays, and need not be gone through again and again
             gc.enable()
-        command.run(arguments[1:])
-    elif not arguments or arguments[0] in ("-h", "--help"):
+        return 0 if getattr(command.run(arguments[1:]), "passed", True) else EXIT_FAILED
+    if not arguments or arguments[0] in ("-h", "--help"):
         print(overview())
     elif arguments[0] == "--version":
         print(f"endopilot {__version__}")
@@ -155,3 +155,4 @@ def _work(name: str, arguments: Sequence[str]) -> None:
         near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
         hint = f"did you mean '{near[0]}'?" if near else "`endopilot --help` lists the commands."
         raise InputError(f"there is no command '{arguments[0]}'; {hint}")
+    return 0

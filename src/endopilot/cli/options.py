@@ -162,8 +162,8 @@ class Command:
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
     def run(self, arguments: Sequence[str], *, shown: bool = True) -> Any:
-        """Do what the arguments ask for, print what comes of it if that is to be `shown`, and return it; None where they
-        ask for a text. InputError for bad arguments, or a bad file of `--config`."""
+        """Do what the arguments ask for, print what comes of it if that is to be `shown`, and return it; None where
+        they ask for a text. InputError for bad arguments, or a bad file of `--config`."""
         if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
             print(self.help(everything="--help-all" in arguments), end="")
             return None

@@ -25,6 +25,7 @@ from typing import Any
 from endopilot.errors import STOPPING, InputError, Remark, Stopped, stop, stop_soon
 from endopilot.extras import what_is_missing
 
+EXIT_FAILED = 1  # a figure misses its bar
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 128 + signal.SIGINT
@@ -42,12 +43,13 @@ _OUT_OF_MEMORY = re.compile(
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-def carry_out(name: str, work: Callable[[], object]) -> int:
-    """Do the work of a command and return its exit code: 0, or the one that it leaves with."""
+def carry_out(name: str, work: Callable[[], int | None]) -> int:
+    """Do the work of a command and return its exit code: the one that the work returns, 0 if none."""
     with _signals() as arrived, _remarks(name):
         try:
-            code = _code_of(work)
+            code = work() or 0
             sys.stdout.flush()
+            return code
         except BaseException as error:
             if arrived or isinstance(error, Stopped):  # whatever a library that was interrupted made of it
                 code = 128 + arrived[0] if arrived else int(str(error.args[0]))  # it came before the block began
@@ -56,7 +58,6 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
                 return _end(name, error)
             except MemoryError as again:
                 return _end(name, again)
-        return code
 
 
 def check_memory_limit() -> None:
@@ -67,16 +68,6 @@ def check_memory_limit() -> None:
             f"memory: limited to {limit / 2**30:.2g} GiB by `ulimit -v`, and the libraries alone take "
             f"{LEAST_MEMORY / 2**30:g} GiB; raise the limit"
         )
-
-
-def _code_of(work: Callable[[], object]) -> int:
-    try:
-        work()
-    except Stopped:
-        raise
-    except SystemExit as leaving:
-        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
-    return 0
 
 
 def own_streams() -> None:
@@ -124,32 +115,39 @@ def _say(name: str, line: str, code: int) -> int:
 
 def _end(name: str, error: BaseException) -> int:
     """Say in one line why a command ends by an exception, and return the exit code."""
-    text = " ".join(str(error).split())
-    if _for_want_of_memory(error):
-        size = re.search(r"allocate ([\d.]+ \w+)", text)
-        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
-        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
-    if isinstance(error, InputError):
-        return _say(name, str(error), EXIT_BAD_INPUT)
-    if isinstance(error, ModuleNotFoundError) and (missing := what_is_missing(error)) is not None:
-        return _say(name, missing, EXIT_BAD_INPUT)
     if isinstance(error, KeyboardInterrupt):
         return _say(name, "interrupted", EXIT_INTERRUPTED)
     if isinstance(error, BrokenPipeError):  # the reader has closed the output, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
         return EXIT_UNREAD
-    if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
-        return _say(name, f"{text}; check the path", EXIT_BAD_INPUT)
-    if isinstance(error, OSError) and error.errno in _FULL:
-        return _say(name, "the disk is full; free some space and run the same command again", EXIT_BAD_INPUT)
-    if isinstance(error, OSError) and error.errno is not None:
-        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-        return _say(name, f"{place}{error.strerror or text}; check the path and its permissions", EXIT_BAD_INPUT)
+    if reason := _mendable(error):
+        return _say(name, reason, EXIT_BAD_INPUT)
     from endopilot.plugins import described
 
     return _say(
         name, f"a defect of endopilot ({described(error)}); please report it with {_record(error)}", EXIT_DEFECT
     )
+
+
+def _mendable(error: BaseException) -> str | None:
+    """Return what happened and what the user can do about it; None if the error is a defect."""
+    text = " ".join(str(error).split())
+    if _for_want_of_memory(error):
+        size = re.search(r"allocate ([\d.]+ \w+)", text)
+        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
+        return f"{what}, more than there is; ask for less at once: fewer, shorter or coarser"
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, ModuleNotFoundError):
+        return what_is_missing(error)
+    if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
+        return f"{text}; check the path"
+    if isinstance(error, OSError) and error.errno in _FULL:
+        return "the disk is full; free some space and run the same command again"
+    if isinstance(error, OSError) and error.errno is not None:
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return f"{place}{error.strerror or text}; check the path and its permissions"
+    return None
 
 
 def _for_want_of_memory(error: BaseException | None) -> bool:
