@@ -56,8 +56,8 @@ COMMANDS = {
 _TOGETHER = {
     "patients": "segment anatomy atlas phantom",
     "data": "dataset dataset-info train evaluate",
-    "navigation": "difficulty plan",
-    "xray": "xray angiograms",
+    "navigation": "difficulty plan advise",
+    "xray": "xray locate angiograms",
     "robots": "replay calibrate",
     "checks": "verify devices",
     "info": "sample completion info",
