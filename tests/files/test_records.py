@@ -15,9 +15,10 @@ from endopilot.dataset.loader import read_manifest
 from endopilot.devices.device import read_wire
 from endopilot.errors import InputError
 from endopilot.files import read_json, read_text, read_yaml, reading, write_json
+from endopilot.imaging.segment import SegmentConfig
 from endopilot.models.checkpoint import load_model
 from endopilot.models.config import read_run
-from endopilot.pipeline.study import Stages
+from endopilot.pipeline.study import Study, StudyConfig
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from toy_navigation import make_untrained_run
@@ -65,7 +66,8 @@ def test_a_manifest_that_is_none(tmp_path, content) -> None:
 
 def test_stages_and_settings_that_are_none(tmp_path) -> None:
     (tmp_path / "stages.json").write_text("[1]")
-    refused(tmp_path, lambda: Stages(tmp_path))
+    given = {"config": StudyConfig(), "segmentation": SegmentConfig(), "device": read_wire("workhorse-014")}
+    refused(tmp_path, lambda: Study(output=tmp_path, origin="", command="", **given))
     for odd in (*ODD, {1: 2}):
         with pytest.raises(InputError):
             from_record(SimulatorConfig, odd)

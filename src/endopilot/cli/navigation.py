@@ -1,5 +1,5 @@
-"""`endopilot difficulty`, `plan` and `advise`: how hard a place is to reach, controls that lead there, and when X-ray is
-needed."""
+"""`endopilot difficulty`, `plan` and `advise`: how hard a place is to reach, controls that lead there, and when X-ray
+is needed."""
 
 from __future__ import annotations
 

@@ -39,6 +39,7 @@ from endopilot.simulation.trajectory import Trajectory
 from endopilot.vessels.read_source import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
+STAGES_FILE, _KEPT = "stages.json", ("finished", "seconds", "rejected")
 EVALUATED = 16  # navigations evaluated in each split; each takes some 13 s of a core
 MISMATCH = (0.8, 1.2)  # friction and tip stiffness of the navigations over those that simulated wires are given
 _EXTRAS = ("learn", "report")  # extras that the stages need, the last one after minutes of work
@@ -51,41 +52,6 @@ UNKNOWN_WIRE = (
     "given."
 )
 RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
-
-
-class Stages:
-    """A run's finished stages, their seconds and rejected patients, kept in `stages.json` of its folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / "stages.json"
-        record = read_json(self._path, keys=()) if self._path.exists() else {}
-        self.finished: list[str] = record.get("finished", [])
-        self.seconds: dict[str, float] = record.get("seconds", {})
-        self.rejected: dict[str, str] = record.get("rejected", {})
-
-    def do(self, name: str, work: Callable[[], None]) -> None:
-        """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
-        if name in self.finished:
-            return
-        start = time.perf_counter()
-        try:
-            work()
-            self.finished.append(name)
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-            record = {"finished": self.finished, "seconds": self.seconds, "rejected": self.rejected}
-            write_json(self._path, record)
-
-    def do_each(self, name: str, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
-        """Do a stage's work for every item. A bad item is rejected and recorded; a bad only item ends the run."""
-
-        def work_on_all() -> None:
-            bad = each(title, items, work)
-            if len(items) == 1 and bad:
-                raise bad[items[0]]
-            self.rejected.update({item.name: str(error) for item, error in bad.items()})
-
-        self.do(name, work_on_all)
 
 
 @settings
@@ -120,26 +86,58 @@ class RunConfig(StudyConfig):
     """How to segment."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Run:
-    """What the stages share: settings and the wire, the record of finished stages, the input's SHA-256s and notes, and
-    for the report where the patients come from and what was typed."""
+@dataclass(kw_only=True)
+class Study:
+    """A run in its folder: settings and the wire, the input's SHA-256s and notes, for the report where the patients
+    come from and what was typed; and, as `stages.json` keeps them, finished stages, their seconds, rejected
+    patients."""
 
     output: Path
     config: StudyConfig
     segmentation: SegmentConfig
     device: Wire
-    stages: Stages
     origin: str
     command: str
     inputs: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     navigation: Path | None = None
+    finished: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    rejected: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Read what an interrupted run has left."""
+        if (self.output / STAGES_FILE).exists():
+            left = read_json(self.output / STAGES_FILE, keys=_KEPT)
+            self.finished, self.seconds, self.rejected = (left[name] for name in _KEPT)
 
     @property
     def trains(self) -> bool:
         """Whether networks are trained here, rather than simulated wires evaluated."""
         return self.config.training_seconds > 0
+
+    def do(self, name: str, work: Callable[[], None]) -> None:
+        """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
+        if name in self.finished:
+            return
+        start = time.perf_counter()
+        try:
+            work()
+            self.finished.append(name)
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            write_json(self.output / STAGES_FILE, {name: getattr(self, name) for name in _KEPT})
+
+    def do_each(self, name: str, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
+        """Do a stage's work for every item. A bad item is rejected and recorded; a bad only item ends the run."""
+
+        def work_on_all() -> None:
+            bad = each(title, items, work)
+            if len(items) == 1 and bad:
+                raise bad[items[0]]
+            self.rejected.update({item.name: str(error) for item, error in bad.items()})
+
+        self.do(name, work_on_all)
 
 
 def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = DemoConfig()) -> dict[str, Any]:
@@ -159,12 +157,11 @@ def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = D
     require_extras(*_EXTRAS)
     device = read_wire(config.device)
     claim(output, "endopilot demo", config=config, device=device)
-    run = _Run(
+    run = Study(
         output=output,
         config=config,
         segmentation=SegmentConfig(method="coronary", vessel="rca"),
         device=device,
-        stages=Stages(output),
         origin=DEMO_ORIGIN,
         command="endopilot demo",
         navigation=output / "navigation",
@@ -172,8 +169,8 @@ def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = D
     atlas = AtlasConfig(vessel="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
     volumes = [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]
-    run.stages.do_each("atlas", "Synthetic patients", truths, partial(_make_patient, config=atlas))
-    run.stages.do_each("phantom", "Synthetic CT angiograms", volumes, partial(_make_volume, config=atlas))
+    run.do_each("atlas", "Synthetic patients", truths, partial(_make_patient, config=atlas))
+    run.do_each("phantom", "Synthetic CT angiograms", volumes, partial(_make_volume, config=atlas))
     anatomies = _anatomies(run, volumes)
 
     def drive() -> None:
@@ -181,7 +178,7 @@ def run_demo(*, output: OutputFolder = Path("runs/demo"), config: DemoConfig = D
         target = tree.section_names[tree.branches[tree.longest_leaf()].section[-1]]
         _navigate(run, anatomies[0], target)
 
-    run.stages.do("navigation", drive)
+    run.do("navigation", drive)
     return _study(run, anatomies)
 
 
@@ -214,26 +211,24 @@ def run_volume(
     inputs = input_hash(volume, content.files)
     identity = {"volume_sha256": inputs[volume.name], "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device)
-    copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
+    copy = output / "ct" / f"patient{VOLUME_SUFFIX}"
     folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
-    stages.do("read", lambda: write_volume(content, copy))
-    notes = content.notes
-    for note in notes:
-        print(note, file=sys.stderr)
-    del content  # up to a gigabyte
     options = "".join(f" --{name} {value}" for name, value in (("series", series), ("phase", phase)) if value)
-    run = _Run(
+    run = Study(
         output=output,
         config=config,
         segmentation=config.segmentation,
         device=device,
-        stages=stages,
         origin=RUN_ORIGIN,
         command=f"endopilot run {volume} -o {output}" + options,
         inputs=inputs,
-        notes=notes,
+        notes=content.notes,
         navigation=folder,
     )
+    run.do("read", lambda: write_volume(content, copy))
+    for note in run.notes:
+        print(note, file=sys.stderr)
+    del content  # up to a gigabyte
     anatomies = _anatomies(run, [copy])
     navigation = {} if target is None else _navigate(run, anatomies[0], target)
     return {name: navigation[name] for name in ("outcome", "page") if name in navigation} | _study(run, anatomies)
@@ -273,23 +268,23 @@ def _beside(volume: Path, folder: str, suffix: str = "") -> Path:
     return volume.parents[1] / folder / f"{volume.name.removesuffix(VOLUME_SUFFIX)}{suffix}"
 
 
-def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
+def _anatomies(run: Study, volumes: Sequence[Path]) -> list[Path]:
     """Segment volumes, extract their anatomies, and return the folders of those where both succeeded."""
     scheme = run.segmentation.vessel if run.segmentation.method == "coronary" else "generic"
     make_mask = partial(_make_mask, config=run.segmentation, notes=run.notes)
     make_anatomy = partial(_make_anatomy, config=AnatomyConfig(vessel=scheme))
-    run.stages.do_each("segmentation", "Segmentation", volumes, make_mask)
-    run.stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
+    run.do_each("segmentation", "Segmentation", volumes, make_mask)
+    run.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
     return [folder for folder in (_beside(volume, "anatomies") for volume in volumes) if folder.exists()]
 
 
-def _navigate(run: _Run, anatomy: Path, target: str) -> dict[str, Any]:
+def _navigate(run: Study, anatomy: Path, target: str) -> dict[str, Any]:
     assert run.navigation is not None
     settings = NavigateConfig(seed=run.config.seed)
     return navigate_into(anatomy, target=target, output=run.navigation, device=run.config.device, config=settings)
 
 
-def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
+def _study(run: Study, anatomies: Sequence[Path]) -> dict[str, Any]:
     """Simulate navigations, train networks on them or take simulated wires, evaluate the model, and report."""
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
@@ -309,12 +304,10 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
         anatomy_shares=shares,
         seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to simulated wires
     )
-    run.stages.do(
-        "dataset", lambda: generate_dataset(anatomies, output=output / "dataset", device=run.device, config=dataset)
-    )
+    run.do("dataset", lambda: generate_dataset(anatomies, output=output / "dataset", device=run.device, config=dataset))
     if trains:
         training = TrainConfig(max_seconds=config.training_seconds, seed=config.seed)
-        run.stages.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
+        run.do("training", lambda: train(output / "dataset", output=output / "training", config=training))
 
     model = output / "training" if trains else Path(WIRES)
 
@@ -323,12 +316,12 @@ def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
         evaluate(model, output=output / "evaluation", config=settings, dataset=output / "dataset")
         report_evaluation(output / "evaluation")
 
-    run.stages.do("evaluation", measure)
-    run.stages.do("report", lambda: _report(run, anatomies))
+    run.do("evaluation", measure)
+    run.do("report", lambda: _report(run, anatomies))
     return _finish(run)
 
 
-def _report(run: _Run, anatomies: Sequence[Path]) -> None:
+def _report(run: Study, anatomies: Sequence[Path]) -> None:
     from endopilot.report.report import PatientContent, write_report  # matplotlib and plotly
 
     output = run.output
@@ -353,8 +346,8 @@ def _report(run: _Run, anatomies: Sequence[Path]) -> None:
         evaluation=output / "evaluation",
         replay=replay,
         navigation=run.navigation,
-        stage_seconds=run.stages.seconds,
-        manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
+        stage_seconds=run.seconds,
+        manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.rejected),
     )
 
 
@@ -378,19 +371,18 @@ def _replay(output: Path) -> tuple[Path, Trajectory]:
     return folder, held_out.trajectory(best, record_shape=True)
 
 
-def _finish(run: _Run) -> dict[str, Any]:
-    output, stages = run.output, run.stages
+def _finish(run: Study) -> dict[str, Any]:
+    output, wall_seconds = run.output, sum(run.seconds.values())
     metrics = read_json(output / "evaluation" / "metrics.json")
-    wall_seconds = sum(stages.seconds.values())
     if not (output / "manifest.json").exists():
         write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
-        facts = {"wall_seconds": wall_seconds, "stages": stages.seconds, "rejected": stages.rejected}
+        facts = {"wall_seconds": wall_seconds, "stages": run.seconds, "rejected": run.rejected}
         record = manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, **facts, notes=run.notes)
         write_json(output / "manifest.json", record)
     return {
         "report": str(output / REPORT_FILE),
         "wall_seconds": round(wall_seconds, 1),
-        "rejected": stages.rejected,
+        "rejected": run.rejected,
         **({"notes": list(run.notes)} if run.notes else {}),
         "findings": metrics["findings"],
     }
