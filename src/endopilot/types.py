@@ -310,12 +310,11 @@ class Anatomy:
                 _add(digest, values, np.float64)
             _add(digest, np.array(branch.parent), np.int64)
         _add(digest, self.distance_map.values, np.float32)
-        for values in (self.distance_map.spacing_mm, self.distance_map.origin_mm):
+        grid, place = self.distance_map, self.insertion
+        numbers = [grid.spacing_mm, grid.origin_mm, place.position, place.direction, self.catheter_radius_mm]
+        numbers += [place.rotation_zero] if isinstance(place.rotation_zero, np.ndarray) else []
+        for values in numbers:
             _add(digest, np.asarray(values), np.float64)
-        for values in (self.insertion.position, self.insertion.direction, self.catheter_radius_mm):
-            _add(digest, np.asarray(values), np.float64)
-        if isinstance(self.insertion.rotation_zero, np.ndarray):
-            _add(digest, self.insertion.rotation_zero, np.float64)
         return digest.hexdigest()
 
 

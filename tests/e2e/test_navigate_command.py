@@ -35,7 +35,7 @@ FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navig
 def patient(tmp_path_factory):
     """Return the folder of a synthetic patient."""
     folder = tmp_path_factory.mktemp("atlas")
-    made = command_of("atlas").answer(["-o", str(folder), "--vessel", "rca", "--count", "1", "--seed", "41"])
+    made = command_of("atlas").run(["-o", str(folder), "--vessel", "rca", "--count", "1", "--seed", "41"], shown=False)
     return folder / made[0]["patient"]
 
 

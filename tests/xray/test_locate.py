@@ -194,7 +194,7 @@ def test_the_command(anatomy, tmp_path) -> None:
     (tmp_path / "c-arm.yaml").write_text(f"matrix: {matrix.tolist()}\n")
     options = ["--camera", str(tmp_path / "c-arm.yaml"), "-o", str(tmp_path / "tips.csv")]
     options += ["--picture", str(tmp_path / "tips.png")]
-    figures = command_of("locate").answer([str(tmp_path / "tree"), str(tmp_path / "lines.csv"), *options])
+    figures = command_of("locate").run([str(tmp_path / "tree"), str(tmp_path / "lines.csv"), *options], shown=False)
     assert figures["found"] == 1 and figures["residual_median_mm"] < 0.5
     assert (tmp_path / "tips.csv").exists() and (tmp_path / "tips.png").stat().st_size > 10_000
 

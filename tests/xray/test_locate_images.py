@@ -67,7 +67,7 @@ def otherwise(made: Path, path: Path) -> Path:
 
 def test_a_cine_of_ones_own_is_read_back_and_the_tip_is_found(made, fork, tmp_path) -> None:
     given = [str(made.parents[1] / "patients" / "fork"), str(made / "cine.dcm"), "-o", str(tmp_path / "tips.csv")]
-    figures = command_of("locate").answer([*given, "--page", str(tmp_path / "tips.html")])
+    figures = command_of("locate").run([*given, "--page", str(tmp_path / "tips.html")], shown=False)
     assert figures["agreement"] > 0.9 and figures["registered"].startswith("by contrast")
     table = np.genfromtxt(tmp_path / "tips.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     found = np.column_stack([table[f"tip_{axis}_mm"] for axis in "xyz"])
@@ -139,7 +139,7 @@ def test_a_landmark_registers_a_png(made, fork, tmp_path) -> None:
     place, pixel = truth["centerline_mm"][30], truth["centerline_px"][0, 30]
     given = [str(made.parents[1] / "patients" / "fork"), str(made / "frames" / "0000.png"), "--camera", str(camera)]
     options = [*given, "-o", str(tmp_path / "tips.csv"), "--landmark-mm", *map(str, place)]
-    figures = command_of("locate").answer([*options, "--landmark-px", *map(str, pixel)])
+    figures = command_of("locate").run([*options, "--landmark-px", *map(str, pixel)], shown=False)
     table = np.genfromtxt(tmp_path / "tips.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     found = np.array([table[f"tip_{axis}_mm"] for axis in "xyz"])
     assert figures["registered"] == "by landmark" and np.linalg.norm(found - truth["wire_mm"][0, 0]) < 2.0

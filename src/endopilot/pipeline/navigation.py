@@ -56,10 +56,10 @@ def navigate_into(
     """
     stack = Stack.of(device, *catheter)
     set_up = set_up_navigation(anatomy, target, policy=policy, device=stack, config=config)
-    _claim(Path(output), set_up)
-    if (Path(output) / MANIFEST_FILE).exists():
-        return read_json(Path(output) / MANIFEST_FILE)["figures"]
-    return _write(drive(set_up), Path(output), {"policy": policy, "device": device, "catheter": tuple(catheter)})
+    _claim(output, set_up)
+    if (output / MANIFEST_FILE).exists():
+        return read_json(output / MANIFEST_FILE)["figures"]
+    return _write(drive(set_up), output, {"policy": policy, "device": device, "catheter": tuple(catheter)})
 
 
 def write_navigation(driven: PatientNavigation, *, output: str | Path) -> dict[str, Any]:
@@ -100,25 +100,20 @@ def _write(found: PatientNavigation, output: Path, asked: Mapping[str, Any] | No
     about = {"policy": set_up.policy_name, "seed": set_up.config.seed, "world": _world(set_up)}
     about["robot"] = asdict(set_up.world.real_robot(set_up.robot))
     replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
-    record = _manifest(found, output)
+    record = _manifest(found, page=str(output / PAGE_FILE) if present["report"] else None)
     if missing := [extra for extra in ("learn", "report") if not present[extra]]:
-        record["figures"]["page"] = str(output / PAGE_FILE) if present["report"] else None
         record["figures"]["left_out"] = f"files that need: pip install 'endopilot[{','.join(missing)}]'"
     if present["learn"]:
         _write_episode(found, driven_in, output / EPISODE_FOLDER)
     if present["report"]:
-        _write_page(found, output, _commands(found, driven_in, output, asked), record)
+        from endopilot.plotting import png  # matplotlib and plotly are slow to import
+        from endopilot.report.navigation_page import navigation_figure, write_navigation_page
+
+        picture, commands = png(navigation_figure(found)), _commands(found, driven_in, output, asked)
+        write_whole(output / PICTURE_FILE, picture)
+        write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
     write_json(output / MANIFEST_FILE, record)
     return read_json(output / MANIFEST_FILE)["figures"]
-
-
-def _write_page(found: PatientNavigation, output: Path, commands: Mapping[str, str], record: dict[str, Any]) -> None:
-    from endopilot.plotting import png  # matplotlib and plotly are slow to import
-    from endopilot.report.navigation_page import navigation_figure, write_navigation_page
-
-    picture = png(navigation_figure(found))
-    write_whole(output / PICTURE_FILE, picture)
-    write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
 
 
 def navigation_table(found: PatientNavigation) -> pd.DataFrame:
@@ -173,7 +168,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
     )
 
 
-def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
+def _manifest(found: PatientNavigation, *, page: str | None) -> dict[str, Any]:
     set_up, record = found.set_up, found.record
     navigation = set_up.navigation
     figures = {
@@ -198,7 +193,7 @@ def _manifest(found: PatientNavigation, output: Path) -> dict[str, Any]:
         "courses_searched": found.plans,
         "planning_processor_s": None if found.planning_s is None else round(found.planning_s, 2),
         "decision_s": decision_times(found),
-        "page": str(output / PAGE_FILE),
+        "page": page,
     }
     return manifest(
         config=set_up.config,
