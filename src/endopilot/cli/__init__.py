@@ -59,8 +59,8 @@ _TOGETHER = {
     "navigation": "difficulty plan advise",
     "xray": "xray locate angiograms",
     "robots": "replay calibrate",
-    "checks": "verify devices",
-    "info": "sample completion info",
+    "servers": "cockpit drive",
+    "checks": "verify devices sample completion info",
 }
 """Modules of several commands that import about the same; others have a module of their own name, or are `_STAGES`."""
 _STAGES = {"demo": "study:run_demo", "run": "study:run_volume", "navigate": "navigation:navigate_into"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,20 +13,8 @@ from rich.table import Column, Table
 
 from endopilot.cli.process import one_line
 from endopilot.files import json_text
-from endopilot.settings import Text, Within, settings
 
 Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
-
-
-@settings
-class ListenConfig:
-    """Where a server listens."""
-
-    host: Text = "127.0.0.1"
-    """Address to listen on; by default only this machine can connect. 0.0.0.0 or :: for all addresses of this
-    machine."""
-    port: Annotated[int, Within(0, 65535)] = 0
-    """TCP port; 0 for a free one."""
 
 
 @dataclass(frozen=True)

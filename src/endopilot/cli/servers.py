@@ -1,17 +1,31 @@
-"""`endopilot cockpit`: watch a wire, alone or in catheters, in a browser, drive by hand, or let a policy drive."""
+"""`endopilot cockpit` and `drive`: a wire in a browser, driven by hand or by a policy; a simulated drive over TLS."""
 
 from __future__ import annotations
 
+import asyncio
+import time
 import webbrowser
 from pathlib import Path
 from typing import Annotated
 
-from endopilot.cli.arguments import ListenConfig
+from endopilot.devices.device import read_wire
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.robot import ASSUMED, read_robot
 from endopilot.errors import InputError
 from endopilot.extras import require_extras
 from endopilot.runs import Existing, Place
-from endopilot.settings import CountOrZero, Within
+from endopilot.settings import CountOrZero, Finite, Text, Within, settings
+
+
+@settings
+class ListenConfig:
+    """Where a server listens."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen on; by default only this machine can connect. 0.0.0.0 or :: for all addresses of this
+    machine."""
+    port: Annotated[int, Within(0, 65535)] = 0
+    """TCP port; 0 for a free one."""
 
 
 def cockpit_command(
@@ -105,3 +119,32 @@ def cockpit_command(
             webbrowser.open(address)
 
     serve(stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)
+
+
+def drive_command(
+    *,
+    certificates: Path,
+    device: str = "workhorse-014",
+    travel_mm: tuple[Finite, Finite] = (0.0, 300.0),
+    listen: ListenConfig = ListenConfig(port=7345),
+    robot: str = ASSUMED,
+) -> None:
+    """Run a simulated robotic drive until Ctrl-C, over TLS (docs/concepts/drive-protocol.md). No medical device.
+
+    Args:
+        certificates: folder with drive.key, drive.crt and client.crt; docs/concepts/drive-protocol.md makes them.
+        device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
+        travel_mm: least and largest inserted length, mm.
+        listen: the drive's address.
+        robot: name of a robot (docs/concepts/robot.md) or a YAML file: latency, accelerations and noise.
+    """
+    from endopilot.robot.drive import Drive, serve, tls_context  # slow to import
+
+    wire = read_wire(device)
+    limits = DriveLimits(
+        max_velocity_mm_s=wire.max_velocity_mm_s, max_rotation_rad_s=wire.max_rotation_rad_s, travel_mm=travel_mm
+    )
+    context = tls_context(certificates, of_drive=True)
+    low, high = travel_mm
+    drive = Drive(limits, now=time.monotonic(), config=read_robot(robot), inserted_length=min(max(low, 0.0), high))
+    asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
