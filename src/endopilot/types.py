@@ -128,7 +128,7 @@ class Centerline:
     @staticmethod
     def joined(lines: Iterable[Centerline]) -> Centerline:
         """Return the points of several lines as those of one, in their order."""
-        parts = [(line.points, line.radius, line.abscissa, line.normals) for line in lines]
+        parts = [vars(line).values() for line in lines]
         return Centerline(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -198,7 +198,8 @@ class VesselTree:
     def path(self, branch: int) -> Centerline:
         """Return the connected line from the ostium to the end of `branch`."""
         lines = [self.branches[i].centerline for i in self.route(branch)]
-        return Centerline.joined([lines[0], *(_without_first_point(line) for line in lines[1:])])
+        rest = [Centerline(*(values[1:] for values in vars(line).values())) for line in lines[1:]]
+        return Centerline.joined([lines[0], *rest])
 
     def longest_path(self) -> Centerline:
         """Return the path from the ostium to the farthest distal end."""
@@ -305,8 +306,7 @@ class Anatomy:
         """
         digest = hashlib.sha256()
         for branch in self.tree.branches:
-            line = branch.centerline
-            for values in (line.points, line.radius, line.abscissa, line.normals):
+            for values in vars(branch.centerline).values():
                 _add(digest, values, np.float64)
             _add(digest, np.array(branch.parent), np.int64)
         _add(digest, self.distance_map.values, np.float32)
@@ -335,7 +335,3 @@ class TipProjection:
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:
     digest.update(repr(values.shape).encode())
     digest.update(np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).data)
-
-
-def _without_first_point(line: Centerline) -> Centerline:
-    return Centerline(line.points[1:], line.radius[1:], line.abscissa[1:], line.normals[1:])

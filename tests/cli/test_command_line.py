@@ -246,6 +246,8 @@ def test_a_file_can_be_started_from_flags(tmp_path, capsys, monkeypatch) -> None
     Path("plan.yaml").write_text(printed)
     again = command_of("plan").read(["patient", "--target", "4", "-o", "o", "--config", "plan.yaml"])
     assert again.speed_mm_s == 5.0 and again.target == "4"
+    Path("none.yaml").write_text("sources: []\noutput: o\n")
+    assert "Missing from endopilot anatomy: [SOURCES ...]" in refused(capsys, "anatomy", "--config", "none.yaml")
 
 
 def test_the_pages_are_made_of_the_commands() -> None:

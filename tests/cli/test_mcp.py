@@ -88,6 +88,8 @@ def test_what_may_be_several_is_a_list(folder) -> None:
         ("plan", {"anatomy": "patient", "target": 4, "output": "p"}, "'4'; the vessel has no such section"),
         ("plan", {"anatomy": "patient", "target": "vessel", "output": "p", "force": 1}, "force"),
         ("navigate", {"anatomy": "patient", "target": "vessel", "output": "p", "policy": "os:system"}, "choose from"),
+        ("atlas", {"output": "p", "count": 0}, "give a whole number from 1 to"),
+        ("anatomy", {"sources": [], "output": "p"}, "Missing from endopilot anatomy"),
         ("segment", {"volume": "none.nii.gz", "output": "m.nii.gz", "method": "os:system"}, "choose from"),
     ],
 )

@@ -126,18 +126,17 @@ def anatomy_command(
 
 def describe(anatomy: Anatomy) -> dict[str, object]:
     """Return the figures of an anatomy: extent, calibre, ostium, and what was repaired."""
-    path, found = anatomy.tree.longest_path(), anatomy.provenance
+    tree, found = anatomy.tree, anatomy.provenance
+    path, lines = tree.longest_path(), [branch.centerline for branch in tree.branches]
     notes = {name: found[name] for name in ("ostium_rule", "ostium_confidence", "notes") if found.get(name)}
     notes["notes"] = found.get("notes", [])[1:]
     return {
-        "branches": len(anatomy.tree.branches),
+        "branches": len(lines),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),
-        "total_length_mm": round(
-            float(sum(b.centerline.abscissa[-1] - b.centerline.abscissa[0] for b in anatomy.tree.branches)), 1
-        ),
+        "total_length_mm": round(float(sum(line.abscissa[-1] - line.abscissa[0] for line in lines)), 1),
         "ostium_radius_mm": round(float(path.radius[0]), 2),
-        "smallest_radius_mm": round(float(min(b.centerline.radius.min() for b in anatomy.tree.branches)), 2),
-        "sections": list(anatomy.tree.sections_present),
+        "smallest_radius_mm": round(float(tree.line.radius.min()), 2),
+        "sections": list(tree.sections_present),
         "ostium_lps_mm": anatomy.insertion.position.round(2).tolist(),
         "insertion_direction": anatomy.insertion.direction.round(3).tolist(),
         "map_spacing_mm": round(anatomy.distance_map.spacing_mm, 3),
