@@ -32,15 +32,6 @@ class Answer:
     passed: bool = True
 
 
-def show_answer(answer: Answer | Figures | None, *, as_json: bool) -> None:
-    """Print what a command returns, as JSON or as text."""
-    if answer is None:
-        return
-    full = answer if isinstance(answer, Answer) else Answer(answer)
-    for part in [full.figures] if as_json or full.shown is None else full.shown:
-        show(part, as_json=as_json)
-
-
 def show(part: Figures | str, *, as_json: bool = False) -> None:
     """Print a line of text; or named figures as aligned lines and rows of the same keys as a table, or both as JSON."""
     if isinstance(part, str):

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, 
 
 import docstring_parser
 
-from endopilot.cli.arguments import show_answer
+from endopilot.cli.arguments import Answer, show
 from endopilot.errors import InputError
 from endopilot.files import regular
 from endopilot.runs import Place, check_new, check_outside, existing
@@ -130,14 +130,14 @@ class Command:
         self._parameters = dict(inspect.signature(function).parameters)
         hints = get_type_hints(function, include_extras=True)
         config = self._parameters.pop("config").default if "config" in self._parameters else None
-        self._config, self._answers = type(config), hints.pop("return") is not NoneType
+        self._config = type(config)
         own = {
             one.name: (hints[one.name] | None, None) if one.default is one.empty else (hints[one.name], one.default)
             for one in self._parameters.values()
         }
         if any(place.of == "file" for kind, _ in own.values() for place in _notes(kind, Place)):
             own |= {"overwrite": (bool, False)}
-        own |= {"json": (bool, False)} if self._answers else {}
+        own |= {} if hints["return"] is NoneType else {"json": (bool, False)}
         self._own = tuple(own)
         content = {"__annotations__": {one: kind for one, (kind, _) in own.items()}}
         content |= {one: default for one, (_, default) in own.items()}
@@ -172,8 +172,10 @@ class Command:
             print(self.file(values), end="")
             return None
         answer = self.call(values)
-        if shown and self._answers:
-            show_answer(answer, as_json=values.json)
+        if shown and answer is not None:
+            full = answer if isinstance(answer, Answer) else Answer(answer)
+            for part in [full.figures] if values.json or full.shown is None else full.shown:
+                show(part, as_json=values.json)
         return answer
 
     def call(self, values: Any) -> Any:
