@@ -26,7 +26,7 @@ from endopilot.devices.robot import RobotConfig, read_robot
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.robot.calibrate import bands, worst
-from endopilot.robot.kinematics import NAMES, Tracks, fit_drive, led
+from endopilot.robot.kinematics import NAMES, fit_drive, led
 from endopilot.robot.log import RobotLog, read_log
 from endopilot.robot.replay import EpisodeReplay, Prepared, ReplayConfig, prepare, replay_prepared, usable_episodes
 from endopilot.types import Anatomy
@@ -69,7 +69,7 @@ def calibrated(logs: Sequence[RobotLog], anatomy: Anatomy, known: RobotConfig, e
     of = prepare([usable[k] for k in chosen], anatomy, 0.5, known)
     names = [log.name for log in of.logs]
     unit = np.unique(names, return_inverse=True)[1]
-    values = dict(zip(NAMES, fit_drive(Tracks(of.courses, of.abscissa), unit).values.tolist(), strict=True))
+    values = dict(zip(NAMES, fit_drive(of, unit).values.tolist(), strict=True))
     wire = replace(known.wire, gain_translation=values["gain_translation"], play_mm=values["play_mm"])
     return replace(known, latency_s=values["latency_s"], wire=wire)
 
@@ -83,7 +83,7 @@ def predicted(of: Prepared, robot: RobotConfig, wire: Wire) -> list[LeftOut]:
         "play alone": replace(robot, latency_s=0.0, wire=replace(plain, play_mm=robot.wire.play_mm)),
         "kinematics": robot,
     }
-    tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
+    tracks = replace(of, abscissa=np.where(of.given, of.abscissa, np.nan))
     simple = {name: led(tracks, each)[0] for name, each in robots.items()}
     at_tips = {"at_s": of.courses.seen_s, "latency_s": np.zeros(1), "gain": np.ones(1), "play": np.zeros(1)}
     drives = np.stack([of.courses.followed(axis, **at_tips)[0] for axis in (0, 1)], axis=-1)

@@ -135,14 +135,14 @@ def calibrate(
         )
     chosen = [episodes[k] for k in evenly(len(episodes), config.episodes)]
     of, layers = prepare(chosen, anatomy, config.given, robot), {}
-    tracks, drive = Tracks(of.courses, of.abscissa), fit_drive(Tracks(of.courses, of.abscissa), _units(of))
+    drive = fit_drive(of, _units(of))
     if of.logs[0].by_velocity:  # what is lost as a drive speeds up, if it needs time for that, is never caught up
         at_once = replace(robot, wire=replace(robot.wire, max_acceleration_mm_s2=_AT_ONCE))
-        others = replace(tracks, courses=Courses.of(of.logs, at_once.wire))
+        others = replace(of, courses=Courses.of(of.logs, at_once.wire))
         other = fit_drive(others, drive.unit)
         if earns(drive.left_out, other.left_out, _BETTER):
-            of, robot, tracks, drive = replace(of, courses=others.courses), at_once, others, other
-    drive, layers["slip"] = _with_layer("slip", tracks, drive)
+            of, robot, drive = others, at_once, other
+    drive, layers["slip"] = _with_layer("slip", of, drive)
     check_forward(logs[0].name, drive)
     robot = _driven(robot, drive)
     robot = replace(robot, encoders_at=where_encoders_sit(of.logs, robot) or robot.encoders_at)
@@ -158,7 +158,7 @@ def calibrate(
             device, robot = with_found(device, robot, {name: of_wire[name].value for name in WIRE})
     replays = ReplayConfig(given=config.given)
     found = replay_prepared(of, Stack(device), robot, replays)
-    drive, layers["slack"] = _with_layer("slack", replace(tracks, slack=_slack(of, found)), drive)
+    drive, layers["slack"] = _with_layer("slack", replace(of, slack=_slack(of, found)), drive)
     if layers["slack"] != LEFT_OUT:
         robot = _driven(robot, drive)
         found = replay_prepared(of, Stack(device), robot, replays)

@@ -170,11 +170,16 @@ def fit_drive(
 def _converged(
     tracks: Tracks, values: Float[np.ndarray, "values"], noise: Noise, free: Bool[np.ndarray, "values"]
 ) -> tuple[Float[np.ndarray, "values"], Noise]:
-    """Return values and noise from which no step costs less."""
+    """Return values and noise from which no step of Gauss and Newton costs less."""
+    low, high = np.array(RANGES).T
     for _ in range(_NEWTON_STEPS):
         start = starts(tracks, values[None], noise)[0][0]
         noise = fit_noise(tracks, values, start, noise)
-        before, values = values, _newton(tracks, values, start, noise, free)
+        found, slope = _sloped(tracks, values, start, noise, free)
+        information = np.einsum("eti,etj->ij", slope, slope) + _WEAK
+        step = -np.linalg.solve(information, np.einsum("eti,et->i", slope, found.innovation))
+        tried = np.clip(values + np.outer([1.0, 0.5, 0.25, 0.1, 0.0], step), low, high)
+        before, values = values, tried[int(np.argmin(starts(tracks, tried, noise)[1].sum(axis=1)))]
         if (np.abs(values - before) < 0.1 * _STEPS).all():
             break
     return values, noise
@@ -276,20 +281,3 @@ def _sloped(
     slope, begin = np.moveaxis(white[:-1], 0, -1) * free, white[-1]
     share = np.einsum("et,eti->ei", begin, slope) / np.maximum((begin**2).sum(axis=1), 1e-12)[:, None]
     return found, slope - begin[..., None] * share[:, None]
-
-
-def _newton(
-    tracks: Tracks,
-    values: Float[np.ndarray, "values"],
-    start: Float[np.ndarray, "episodes"],
-    noise: Noise,
-    free: Bool[np.ndarray, "values"],
-) -> Float[np.ndarray, "values"]:
-    """Return values after a step of Gauss and Newton, as long as it costs less."""
-    found, slope = _sloped(tracks, values, start, noise, free)
-    low, high = np.array(RANGES).T
-    information = np.einsum("eti,etj->ij", slope, slope) + _WEAK
-    step = -np.linalg.solve(information, np.einsum("eti,et->i", slope, found.innovation))
-    tried = np.clip(values + np.outer([1.0, 0.5, 0.25, 0.1, 0.0], step), low, high)
-    _, cost = starts(tracks, tried, noise)
-    return tried[int(np.argmin(cost.sum(axis=1)))]

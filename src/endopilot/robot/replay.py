@@ -9,11 +9,11 @@ the branch that the core takes, and the tip is expected beside it by what tips b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.distance import cdist
 
 from endopilot.anatomy.projection import TipProjector
@@ -116,14 +116,12 @@ class EpisodeReplay:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Prepared(Tracks):
     """Episodes and what was seen in them, with the vessel."""
 
     logs: list[RobotLog]
-    courses: Courses
     anatomy: Anatomy
-    abscissa: Float[np.ndarray, "episodes tips"]
     branch: Float[np.ndarray, "episodes tips"]
     given: Bool[np.ndarray, "episodes tips"]
 
@@ -179,7 +177,7 @@ def prepare(logs: list[RobotLog], anatomy: Anatomy, given: float, robot: RobotCo
         count, tip = int(log.seen.sum()), project(log.tip[log.seen])
         abscissa[k, :count], branch[k, :count] = tip.abscissa, tip.branch
         share[k, : max(1, round(given * count))] = True
-    return Prepared(logs, courses, anatomy, abscissa, branch, share & courses.seen)
+    return Prepared(courses, abscissa, logs=logs, anatomy=anatomy, branch=branch, given=share & courses.seen)
 
 
 def replay_prepared(
@@ -190,26 +188,27 @@ def replay_prepared(
 ) -> list[EpisodeReplay]:
     """Replay episodes that are prepared, as `replay_log` does."""
     device, simulator = in_grip(device, robot, PRESETS["fast"])
-    tracks = Tracks(of.courses, np.where(of.given, of.abscissa, np.nan))
-    driven, seen, start, noise = led(tracks, robot)
+    known = replace(of, abscissa=np.where(of.given, of.abscissa, np.nan))
+    driven, seen, start, noise = led(known, robot)
     times, course = _proximal(of, robot, start)
     angles = np.tile(2 * np.pi * np.arange(config.rotations) / config.rotations, (len(of.logs), 1))
     tried = _simulated(of, device, times, course, seen.offset, angles, simulator)
-    likely, rows = _likely(of, tried, angles[0]), np.arange(len(of.logs))
-    first = np.argmax(likely, axis=1)
-    known = [_known_rotation(_far_from(of, tried.tip, int(k), of.given), angles[k]) for k in rows]
+    first = np.argmax(_likely(of, tried, angles[0]), axis=1)
     # Once more where the wire lay deeper, or less deep, than without the vessel.
-    apart = tracks.abscissa - tried.abscissa[rows, first]
-    depth = seen.offset + filtered(apart, tracks.travel(robot.latency_s), noise).offset
-    best = _simulated(of, device, times, course, depth, angles[rows, first][:, None], simulator)
+    apart = known.abscissa.copy()
+    apart[of.courses.seen] -= np.concatenate([each.abscissa[k] for each, k in zip(tried, first, strict=True)])
+    depth = seen.offset + filtered(apart, known.travel(robot.latency_s), noise).offset
+    turned = np.take_along_axis(angles, first[:, None], axis=1)
+    best = _simulated(of, device, times, course, depth, turned, simulator)
     expected = _expected(of, best, driven)
-    return [
-        _episode(of, k, best, expected[k], driven[k], (float(angles[k, first[k]]), known[k]), times[k, 1:])
-        for k in rows.tolist()
-    ]
+    rotations = [(turn, _known_rotation(_far_from(of, tried[k], k, of.given))) for k, turn in enumerate(turned[:, 0])]
+    ends = times[:, 1:]
+    return [_episode(of, k, best[k], expected[k], driven[k], ends[k], each) for k, each in enumerate(rotations)]
 
 
-def _expected(of: Prepared, best: _Tried, driven: Float[np.ndarray, "episodes tips"]) -> list[Float[np.ndarray, "_ 3"]]:
+def _expected(
+    of: Prepared, best: list[_Tried], driven: Float[np.ndarray, "episodes tips"]
+) -> list[Float[np.ndarray, "_ 3"]]:
     """Return where tips are expected: beside where kinematics lead them in the core's branch, or beside the core's tip,
     whichever was nearer to tips before.
 
@@ -224,7 +223,7 @@ def _expected(of: Prepared, best: _Tried, driven: Float[np.ndarray, "episodes ti
         count = int(of.courses.seen[k].sum())
         given, led_mm, branch = of.given[k, :count], driven[k, :count], of.branch[k, :count]
         since = [np.cumsum(np.abs(np.diff(led_mm, prepend=led_mm[0]))), np.full(count, k)]
-        core, taken = best.tip[k, 0, :count], best.branch[k, 0, :count]
+        core, taken = best[k].tip[0], best[k].branch[0]
         lines = _on_lines(of, led_mm, branch), _on_lines(of, led_mm, np.where(given, branch, taken))
         tried = []
         for j, (real, led_to) in enumerate((lines, (core, core))):
@@ -276,13 +275,12 @@ def _proximal(
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Worlds of each episode: their tips where the real one was seen, and the drive's force at the ends of periods, N;
-    NaN beyond an episode's end."""
+    """Worlds of one episode: their tips where the real one was seen, and their drives' force at ends of periods, N."""
 
-    tip: Float[np.ndarray, "episodes worlds tips 3"]
-    abscissa: Float[np.ndarray, "episodes worlds tips"]
-    branch: Float[np.ndarray, "episodes worlds tips"]
-    force: Float[np.ndarray, "episodes worlds periods"]
+    tip: Float[np.ndarray, "worlds tips 3"]
+    abscissa: Float[np.ndarray, "worlds tips"]
+    branch: Int[np.ndarray, "worlds tips"]
+    force: Float[np.ndarray, "worlds periods"]
 
 
 def _simulated(
@@ -293,19 +291,16 @@ def _simulated(
     depth: Float[np.ndarray, "episodes"],
     angles: Float[np.ndarray, "episodes worlds"],
     simulator: SimulatorConfig,
-) -> _Tried:
+) -> list[_Tried]:
     """Simulate worlds that begin at some depth, with some rotations; short episodes together, and long ones."""
     place = course.copy()
     place[..., 0] = np.maximum(place[..., 0] + depth[:, None], 0.0)
     fastest = device.fastest[0]
     control = np.clip(np.diff(place, axis=1) / _PERIOD_S, -fastest, fastest)
-    seen_s = of.courses.seen_s
-    samples = np.ceil((seen_s.max(axis=1) - times[:, 0]) / _PERIOD_S - 1e-9).astype(int)
-    tip = np.empty((*angles.shape, seen_s.shape[1], 3))
-    abscissa, branch = np.empty(tip.shape[:-1]), np.empty(tip.shape[:-1])
-    force = np.full((*angles.shape, control.shape[1]), np.nan)
+    samples, tried = np.ceil((of.courses.seen_s.max(axis=1) - times[:, 0]) / _PERIOD_S - 1e-9).astype(int), {}
     for some in np.array_split(np.argsort(samples), max(1, len(samples) // _TOGETHER)):
         last, worlds = int(samples[some].max()), angles[some].size
+        rows = np.arange(worlds).reshape(len(some), -1)
         initial = np.repeat(place[some, None, 0], angles.shape[1], axis=1)
         initial[..., 1] += angles[some]
         begun, turned = (initial[..., axis].reshape(-1, 1) for axis in range(2))
@@ -315,26 +310,26 @@ def _simulated(
         made = Simulator(of.anatomy, device, worlds=worlds, config=simulator, reach_mm=deepest)
         made.reset(inserted_length=begun, rotation=turned)
         moved = made.run(driven, period_s=_PERIOD_S)
-        for row, (k, j) in enumerate((k, j) for k in some for j in range(angles.shape[1])):
-            ends = times[k, 1 : last + 1]
-            places = np.column_stack([moved.tip_position[row, :, 0], moved.tip.abscissa[row, :, 0]])
-            at_tips = places_on(places, ends, seen_s[k])
-            tip[k, j], abscissa[k, j] = at_tips[:, :3], at_tips[:, 3]
-            nearest = np.clip(np.searchsorted(ends, seen_s[k]), 0, last - 1)
-            branch[k, j], force[k, j, :last] = moved.tip.branch[row, nearest, 0], moved.drive_force[row, :, 0]
-    return _Tried(tip, abscissa, branch, force)
+        for k, own in zip(some.tolist(), rows, strict=True):
+            ends, seen_s = times[k, 1 : last + 1], of.courses.seen_s[k, of.courses.seen[k]]
+            places = np.dstack([moved.tip_position[own, :, 0], moved.tip.abscissa[own, :, 0]])
+            at_tips = np.stack([places_on(each, ends, seen_s) for each in places])
+            branch = moved.tip.branch[own, :, 0][:, np.clip(np.searchsorted(ends, seen_s), 0, last - 1)]
+            tried[k] = _Tried(at_tips[..., :3], at_tips[..., 3], branch, moved.drive_force[own, :, 0])
+    return [tried[k] for k in range(len(samples))]
 
 
 def _far_from(
-    of: Prepared, tip: Float[np.ndarray, "episodes worlds tips 3"], k: int, used: Bool[np.ndarray, "episodes tips"]
+    of: Prepared, tried: _Tried, k: int, used: Bool[np.ndarray, "episodes tips"]
 ) -> Float[np.ndarray, "worlds used"]:
     """Return how far tips of an episode are from the real ones that are used, at most `FAR_MM`, mm."""
-    count = int(of.courses.seen[k].sum())
-    far = np.linalg.norm(_in_view(of.logs[k], tip[k, :, :count]), axis=-1)[:, used[k, :count]]
-    return np.minimum(far, FAR_MM)
+    far = np.linalg.norm(_in_view(of.logs[k], tried.tip), axis=-1)
+    return np.minimum(far[:, used[k, of.courses.seen[k]]], FAR_MM)
 
 
-def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "episodes worlds"]:
+def _likely(
+    of: Prepared, tried: list[_Tried], angles: Float[np.ndarray, "worlds"]
+) -> Float[np.ndarray, "episodes worlds"]:
     """Return how likely the worlds of each episode are: by how far its given tips are from the real ones, of which the
     last count most, for where the wire lies when the prediction begins matters, and by how the log's episodes before
     ended. A wire that nobody clamped anew keeps its rotation on the drive, as the rotations so far tell."""
@@ -347,10 +342,10 @@ def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) ->
         near = np.exp((np.cos(on_drive) - 1) / _KEEPS_RAD**2)
         near /= near.sum(axis=0)
         foretold = trust * near @ known + (1 - trust) / count
-        far = _far_from(of, tried.tip, k, of.given)
+        far = _far_from(of, tried[k], k, of.given)
         cost = np.average(far, axis=1, weights=np.exp(-np.arange(far.shape[1])[::-1] / far.shape[1] / _FADES))
         found[k] = foretold * np.exp((cost.min() - cost) / _TELLS_MM)
-        whole = _far_from(of, tried.tip, k, of.courses.seen).mean(axis=1)
+        whole = _far_from(of, tried[k], k, of.courses.seen).mean(axis=1)
         likely = np.exp((whole.min() - whole) / _TELLS_MM)
         trust = float(np.clip(trust * (near @ known @ likely) / (foretold @ likely), 0.05, 0.95))
         known = near.T @ (foretold * likely)
@@ -358,13 +353,13 @@ def _likely(of: Prepared, tried: _Tried, angles: Float[np.ndarray, "worlds"]) ->
     return found / found.sum(axis=1, keepdims=True)
 
 
-def _known_rotation(far: Float[np.ndarray, "worlds given"], angles: Float[np.ndarray, "worlds"]) -> float:
+def _known_rotation(far: Float[np.ndarray, "worlds given"]) -> float:
     """Return half the arc of the rotations that are as good as the best, rad, by how far the tips of worlds, which
-    began with equal angles, are from the real ones, mm; NaN where that is most of a turn."""
+    began at equal angles, are from the real ones, mm; NaN where that is most of a turn."""
     parts = [part.sum(axis=1) for part in np.array_split(far, LEAST_EPISODES, axis=1)]
-    good = Candidates({}, angles[:, None], np.stack(parts, axis=1)).as_good
+    good = Candidates({}, np.empty((len(far), 0)), np.stack(parts, axis=1)).as_good
     gaps = np.diff(np.flatnonzero(np.tile(good, 2))[: good.sum() + 1])
-    arc = 1 - (gaps.max() - 1) / len(angles)  # of a turn, with half a step to either side
+    arc = 1 - (gaps.max() - 1) / len(far)  # of a turn, with half a step to either side
     return np.pi * arc if arc < UNKNOWN_SHARE else np.nan
 
 
@@ -383,19 +378,16 @@ def _episode(
     best: _Tried,
     expected: Float[np.ndarray, "seen 3"],
     driven: Float[np.ndarray, "tips"],
+    ends: Float[np.ndarray, "times"],
     rotation: tuple[float, float],
-    ends: Float[np.ndarray, "periods"],
 ) -> EpisodeReplay:
     log, count = of.logs[k], int(of.courses.seen[k].sum())
     line = of.anatomy.tree.path(int(of.branch[k, count - 1]))
     nearest = np.clip(np.searchsorted(line.abscissa, of.abscissa[k, :count]), 0, len(line.points) - 1)
-    simulated = best.force[k, 0]
     measured = np.isfinite(log.load[:, 0, 0]) & (log.time_s >= log.time_s[log.seen][0])
-    tip, given = best.tip[k, 0, :count], of.given[k, :count]
+    tip, given, force = best.tip[0], of.given[k, :count], best.force[0]
     predicted = np.where(given[:, None], tip, expected)
-    pushed = np.interp(
-        log.time_s[measured] - log.time_s[0], ends[np.isfinite(simulated)], simulated[np.isfinite(simulated)]
-    )
+    pushed = np.interp(log.time_s[measured] - log.time_s[0], ends[: len(force)], force)
     return EpisodeReplay(
         number=int(log.episode[0]),
         time_s=log.time_s[log.seen],
@@ -403,14 +395,14 @@ def _episode(
         seen=log.tip[log.seen],
         simulated=tip,
         predicted=predicted,
-        abscissa=np.column_stack([of.abscissa[k, :count], best.abscissa[k, 0, :count]]),
+        abscissa=np.column_stack([of.abscissa[k, :count], best.abscissa[0]]),
         driven=driven[:count],
         in_view=_in_view(log, predicted),
         core_mm=np.linalg.norm(_in_view(log, tip), axis=1),
         along=tangents(line.points)[nearest],
-        branch=np.column_stack([of.branch[k, :count], best.branch[k, 0, :count]]),
+        branch=np.column_stack([of.branch[k, :count], best.branch[0]]),
         force=np.column_stack([log.load[measured, 0, 0], pushed]),
-        rotation_rad=rotation[0],
+        rotation_rad=float(rotation[0]),
         rotation_known_rad=rotation[1],
     )
 
