@@ -31,8 +31,7 @@ import yaml
 import endopilot
 from endopilot.anatomy.catheter_axis import with_axis
 from endopilot.tasks.task import list_tasks
-from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import Polylines
+from endopilot.vessels.sources import Polylines, read_source
 
 POISSON = 0.49
 TIP_RADIUS_MM, TIP_DEG = 12.1, 72.0

@@ -28,7 +28,7 @@ from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
 from endopilot.runs import existing
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
-from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import read_source
 from endopilot.vessels.surface import BAND_MM, distance_map_from_surface, surface_from_mask
 
 VOXELS_MM = ((0.35, 0.35, 0.35), (0.5, 0.5, 0.5), (0.35, 0.35, 0.5), (0.4, 0.4, 0.8))

@@ -19,7 +19,7 @@ from endopilot.imaging.volume import read_volume
 from endopilot.progress import progress
 from endopilot.runs import existing
 from endopilot.types import Anatomy, LumenMask, Volume
-from endopilot.vessels.read_source import MASK_SUFFIXES
+from endopilot.vessels.sources import MASK_SUFFIXES
 
 TRUTH_FILE = "ostia.json"
 

@@ -20,8 +20,7 @@ from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask
 from endopilot.types import Insertion, LumenMask, Volume
-from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import Polylines
+from endopilot.vessels.sources import Polylines, read_source
 from endopilot.vessels.surface import Surface, surface_from_mask
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"

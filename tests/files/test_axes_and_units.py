@@ -11,8 +11,7 @@ from make_meshes import SLICER, arc, markup, tube, write_lines, write_surface
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.errors import InputError
 from endopilot.types import LumenMask, Volume
-from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import AnatomySource, Polylines, check_unit, transformed
+from endopilot.vessels.sources import AnatomySource, Polylines, check_unit, read_source, transformed
 from endopilot.vessels.surface import Surface
 
 RAS = np.array([-1.0, -1.0, 1.0])

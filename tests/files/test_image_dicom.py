@@ -10,7 +10,7 @@ from endopilot.errors import InputError
 from endopilot.files import sha256
 from endopilot.imaging.volume import read_mask, read_volume, write_volume
 from endopilot.types import Volume
-from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import read_source
 
 
 def _phases(folder, tag, values, *, vary=0.0):

@@ -19,8 +19,7 @@ from endopilot.atlas.atlas import VESSELS, AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 from endopilot.types import LumenMask, Volume
 from endopilot.vessels.line_graph import found_lines
-from endopilot.vessels.read_source import read_source
-from endopilot.vessels.sources import ASSUMED, Polylines, check_unit
+from endopilot.vessels.sources import ASSUMED, Polylines, check_unit, read_source
 from endopilot.vessels.surface import Surface, surface_from_mask
 
 

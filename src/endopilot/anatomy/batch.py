@@ -14,8 +14,7 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.errors import InputError
 from endopilot.parallel import each
 from endopilot.runs import claiming
-from endopilot.vessels.read_source import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
-from endopilot.vessels.sources import AnatomySource
+from endopilot.vessels.sources import MASK_SUFFIXES, SURFACE_SUFFIXES, AnatomySource, read_source
 
 
 def extract_all(

@@ -33,7 +33,6 @@ from endopilot.vessels.graph import lumen_graph
 from endopilot.vessels.inlet import beyond_parent, component, entrance, grid_points, in_front, inlets
 from endopilot.vessels.line_graph import found_lines
 from endopilot.vessels.medial_lines import traced_lines
-from endopilot.vessels.read_source import read_source
 from endopilot.vessels.sources import (
     ANSWERED,
     ASSUMED,
@@ -41,6 +40,7 @@ from endopilot.vessels.sources import (
     AnatomySource,
     Polylines,
     check_unit,
+    read_source,
     transformed,
     unit_name,
 )

@@ -21,7 +21,7 @@ from endopilot.progress import progress
 from endopilot.runs import Existing, OutputFile, OutputFolder, Picture, check_outside, claiming, existing
 from endopilot.settings import Seed
 from endopilot.types import Anatomy
-from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import read_source
 
 
 def segment_command(

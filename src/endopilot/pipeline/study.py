@@ -36,7 +36,7 @@ from endopilot.progress import progress
 from endopilot.runs import Existing, OutputFolder, claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.vessels.read_source import read_source
+from endopilot.vessels.sources import read_source
 
 VOLUME_SUFFIX = ".nii.gz"
 STAGES_FILE, _KEPT = "stages.json", ("finished", "seconds", "rejected")

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from endopilot.lines import length_along
@@ -80,9 +79,7 @@ def skeleton_of(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "
 
 def open_ends(skeleton: Skeleton) -> list[OpenEnd]:
     """Return every end of a skeleton, described as the root of its tree."""
-    length, before = dijkstra(skeleton.costs, directed=False, indices=skeleton.tips, return_predecessors=True)
-    trees = zip(skeleton.tips, length, before, strict=True)
-    return [_described(skeleton, int(tip), own, back) for tip, own, back in trees]
+    return [_described(skeleton.shortest(int(tip)), int(tip)) for tip in skeleton.tips]
 
 
 def rank_correlation(one: Float[np.ndarray, "n"], other: Float[np.ndarray, "n"]) -> float:
@@ -95,8 +92,8 @@ def _ranks(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return (np.cumsum(count) - (count - 1) / 2)[place]
 
 
-def _described(skeleton: Skeleton, tip: int, length: Float[np.ndarray, "n"], before: Int[np.ndarray, "n"]) -> OpenEnd:
-    points, radius, position = skeleton.points, skeleton.radius, skeleton.points[tip]
+def _described(tree: RootedGraph, tip: int) -> OpenEnd:
+    points, radius, length, before, position = tree.points, tree.radius, tree.length, tree.before, tree.points[tip]
     near = (length > _NEAR_MM[0]) & (length < _NEAR_MM[1])
     first = (length > _HEADING_MM[0]) & (length < _HEADING_MM[1])
     width = float(np.quantile(radius[near], 0.6)) if near.any() else 0.0
@@ -112,13 +109,14 @@ def _described(skeleton: Skeleton, tip: int, length: Float[np.ndarray, "n"], bef
         widening=float(np.mean(np.log(radius[begun] / narrowest[begun]))) if begun.any() else 0.0,
         heading=_unit((points[first] if first.any() else points).mean(axis=0) - position),
         course=_unit(points.mean(axis=0) - position),
-        opening_deg=_opening(points, length, before),
+        opening_deg=_opening(tree),
         longest_mm=float(length.max()),
     )
 
 
-def _opening(points: Float[np.ndarray, "n 3"], length: Float[np.ndarray, "n"], before: Int[np.ndarray, "n"]) -> float:
-    """Return the angle between the two longest branches at the first fork within 16 mm of an end, degrees."""
+def _opening(tree: RootedGraph) -> float:
+    """Return the angle between the two longest branches at the first fork within 16 mm of the root, degrees."""
+    points, length, before = tree.points, tree.length, tree.before
     behind = length.copy()  # farthest length behind every node
     order = np.argsort(-length)
     for node in order:

@@ -109,6 +109,11 @@ class VesselGraph:
         first = order[np.diff(key[order], prepend=-1) != 0]
         return replace(self, costs=csr_matrix((cost[first], pairs[first].T), shape=self.costs.shape))
 
+    def shortest(self, roots: Int[np.ndarray, "k"] | int) -> RootedGraph:
+        """Return the graph, whose costs are lengths, with the ways to the nearest root: of infinite length if none."""
+        length, before, _ = dijkstra(self.costs, directed=False, indices=roots, return_predecessors=True, min_only=True)  # pyright: ignore[reportAssignmentType]
+        return RootedGraph(self.points, self.radius, self.costs, self.step_mm, before, length)
+
     def rooted(self, node: int) -> RootedGraph:
         """Return the part of the graph that a root reaches, with the cheapest ways to it."""
         cost, before = dijkstra(self.costs, directed=False, indices=node, return_predecessors=True)

@@ -95,10 +95,8 @@ def part_at(
     distance_map: DistanceMap, labels: Integer[np.ndarray, "nz ny nx"], place: Insertion
 ) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the labelled part of a lumen that is nearest to a place."""
-    index = np.argwhere(labels > 0)
-    points = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
-    nearest = index[np.linalg.norm(points - place.position, axis=1).argmin()]
-    return labels == labels[tuple(nearest)]
+    points, _ = grid_points(distance_map, labels > 0)
+    return labels == labels[labels > 0][np.linalg.norm(points - place.position, axis=1).argmin()]
 
 
 def entrance(
@@ -179,16 +177,14 @@ def _parent_region(
     if not core.any():
         return None
     root = graph.points[int(np.flatnonzero(graph.before < 0)[0])]
-    index = np.argwhere(core)
-    points = distance_map.origin_mm + spacing * index[:, ::-1]
+    points, clearance = grid_points(distance_map, core)
     gap = np.linalg.norm(points - root, axis=1)
     # The inlet lies on the parent's own wall, which is not round: at most about its width away from a centre.
-    reach = 2.0 * distance_map.values[tuple(index.T)] + 2.0 * spacing
-    touching = np.flatnonzero(gap < reach)
+    touching = np.flatnonzero(gap < 2.0 * clearance + 2.0 * spacing)
     if len(touching) == 0:
         return None
     labels = connected_components(core, corners=True)
-    own = labels == labels[tuple(index[touching[gap[touching].argmin()]])]
+    own = labels == labels[core][touching[gap[touching].argmin()]]
     return inside & (np.asarray(distance_transform_edt(~own)) * spacing < wide + spacing)
 
 

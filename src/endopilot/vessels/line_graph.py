@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError, place_text
 from endopilot.lines import length_along, places_on
 from endopilot.types import Insertion
 from endopilot.vessels.ends import likely_inlets
-from endopilot.vessels.graph import Line, RootedGraph, VesselGraph, pieces, split
+from endopilot.vessels.graph import Line, VesselGraph, pieces, split
 from endopilot.vessels.remarks import longest_first
 from endopilot.vessels.sources import Polylines
 
@@ -118,19 +117,14 @@ def found_lines(source: Polylines, given: Insertion | None, label: str, vessel: 
                 "centerline; check the coordinates (LPS mm)"
             )
     else:
-        tree = _rooted(graph, _widest_end(graph, vessel, label))
+        tree = graph.shortest(_widest_end(graph, vessel, label))
         ends = [line[[0, -1]] for line in source.points]
         root, rule = likely_inlets(tree, tree.traced(_SHORTEST_MM, together=True), lines=ends)[0].node, "widest end"
-    lines = _lines(graph.points, graph.radius, _rooted(graph, root).traced(_SHORTEST_MM, together=True))
+    lines = _lines(graph.points, graph.radius, graph.shortest(root).traced(_SHORTEST_MM, together=True))
     piece = np.full(len(keep), -1)
     piece[keep] = graph.pieces
     lost, balance = _left_out(whole, lines, piece, int(graph.pieces[root]))
     return FoundLines(lines, rule, notes + lost, {**balance, "bridged_mm": round(float(bridged.sum()), 1)})
-
-
-def _rooted(graph: LineGraph, root: int) -> RootedGraph:
-    length, before = dijkstra(graph.costs, directed=False, indices=root, return_predecessors=True)
-    return RootedGraph(graph.points, graph.radius, graph.costs, graph.step_mm, before, length)
 
 
 def line_graph(source: Polylines) -> LineGraph:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import KDTree
 
 from endopilot.imaging.grid import connected_components
@@ -53,9 +53,7 @@ class MedialLines(VesselGraph):
     def tree(self) -> RootedGraph:
         """The ways from each piece's widest place."""
         order = np.lexsort((-self.radius, self.pieces))
-        roots = order[np.unique(self.pieces[order], return_index=True)[1]]
-        length, before, _ = dijkstra(self.costs, directed=False, indices=roots, return_predecessors=True, min_only=True)  # pyright: ignore[reportAssignmentType]
-        return RootedGraph(self.points, self.radius, self.costs, self.step_mm, before, length)
+        return self.shortest(order[np.unique(self.pieces[order], return_index=True)[1]])
 
     @cached_property
     def behind_mm(self) -> Float[np.ndarray, "n"]:
