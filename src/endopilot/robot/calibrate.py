@@ -280,15 +280,14 @@ def with_found(device: Wire, robot: RobotConfig, found: Mapping[str, float]) -> 
 
 def where_encoders_sit(episodes: Sequence[RobotLog], robot: RobotConfig) -> str | None:
     """Return "motor" if the wire's encoders follow its commands, "wire" if gain and play too; None without readings."""
-    far, drive = [], robot.wire
+    far, drive, late = [], robot.wire, np.full(2, robot.latency_s)
+    gain, play = np.array([[1.0, drive.gain_translation], [0.0, drive.play_mm]])
     for log in episodes:
-        nothing = np.full_like(log.pixel, np.nan)
-        read = replace(log, tip=log.encoders[:, 0, [0, 0, 0]], pixel=nothing, used=np.ones(len(log), dtype=bool))
-        if read.seen.sum() > 1:
-            of, both = Courses.of([read], drive), np.array([[1.0, 0.0], [drive.gain_translation, drive.play_mm]])
-            late, (gain, play) = np.full(2, robot.latency_s), both.T
-            motion = of.followed(0, at_s=of.seen_s, latency_s=late, gain=gain, play=play)[:, 0]
-            far.append(np.std(read.tip[read.seen, 0] - motion, axis=1))
+        read = np.isfinite(log.encoders[:, 0, 0])
+        if read.sum() > 1:
+            course, at_s = Courses.of([log], drive), (log.time_s[read] - log.time_s[0])[None]
+            motion = course.followed(0, at_s=at_s, latency_s=late, gain=gain, play=play)[:, 0]
+            far.append(np.std(log.encoders[read, 0, 0] - motion, axis=1))
     return ("motor", "wire")[int(np.argmin(np.median(far, axis=0)))] if far else None
 
 

@@ -57,9 +57,8 @@ _NUMBER = re.compile(
 
 class Drive:
     """The machine: motion, watchdog, and its client, if one has `taken` it. `stopped` is why it stands still, or None
-    while it is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked";
-    `dropped` counts commands whose ticket was too old, void or never given; `news` are lines for people, who take them
-    out."""
+    while it is armed: "start", "silence", "connection", "not-finite", "limit", "travel", "malformed" or "asked"; `news`
+    are lines for people, who take them out."""
 
     def __init__(
         self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
@@ -76,7 +75,6 @@ class Drive:
         self._wanted: tuple[float, float] | None = None
         self._state: str | None = None
         self.stopped: str | None = "start"
-        self.dropped = 0
         self.taken, self._held = False, b""
         self.news: deque[str] = deque(maxlen=_MOST_NEWS)
 
@@ -84,11 +82,6 @@ class Drive:
     def position(self) -> tuple[float, float]:
         """Δ, mm, and φ, rad, by the motor, as they are."""
         return float(self._motion.motor[0, 0, 0]), float(self._motion.motor[0, 0, 1])
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether the motor stands still."""
-        return not self._motion.velocity.any()
 
     @property
     def due(self) -> float:
@@ -115,19 +108,14 @@ class Drive:
                 f"stopped at {self._now - self._began:.3f} s: {reason}; {self.position[0]:.2f} mm inserted"
             )
 
-    def arm(self, ticket: str) -> None:
-        """Take commands from now on, if stopped; the watchdog runs."""
-        heard = self._given(ticket)
-        if heard is not None and self.stopped is not None:
-            self.stopped, self._state, self._heard = None, None, heard
-
-    def move(self, ticket: str, translation: float, rotation: float) -> None:
-        """Take a command, mm/s and rad/s, if armed and the ticket lasts; the newest of one instant alone is obeyed, and
-        one that is not finite or beyond the limits stops the drive."""
-        heard = self._given(ticket)
-        if heard is None or self.stopped is not None:
-            return
-        if not (math.isfinite(translation) and math.isfinite(rotation)):
+    def _move(self, heard: float | None, translation: float | None, rotation: float | None) -> None:
+        """Take a command, mm/s and rad/s, if armed and its ticket lasts; the newest of one instant alone is obeyed, and
+        one that is no number, not finite or beyond the limits stops the drive."""
+        if translation is None or rotation is None:
+            self.stop("malformed")
+        elif heard is None or self.stopped is not None:
+            pass
+        elif not (math.isfinite(translation) and math.isfinite(rotation)):
             self.stop("not-finite")
         elif abs(translation) > self._limits.max_velocity_mm_s or abs(rotation) > self._limits.max_rotation_rad_s:
             self.stop("limit")
@@ -144,11 +132,13 @@ class Drive:
             self._state = f"STATE {read} {status} {self._ticket()}\n"
         return self._state
 
-    def open(self) -> None:
-        """Take a client, of which there is one at a time."""
+    def open(self) -> bytes:
+        """Take a client, of which there is one at a time, and return the first line to it: protocol and limits."""
         assert not self.taken
         self.taken, self._held = True, b""
         self.news.append("a client is connected")
+        limits = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, *self._limits.travel_mm)
+        return f"{PROTOCOL} {' '.join(repr(float(value)) for value in limits)}\n".encode("ascii")
 
     def receive(self, data: bytes, now: float) -> bytes | None:
         """Take bytes of the client as they came, cut anywhere, and return an answer for each line that they end; None
@@ -177,22 +167,13 @@ class Drive:
             case ["STOP"]:
                 self.stop("asked")
             case ["ARM", ticket]:
-                self.arm(ticket)
-            case ["MOVE", ticket, first, second]:
-                translation, rotation = number(first), number(second)
-                if translation is None or rotation is None:
-                    self.stop("malformed")
-                else:
-                    self.move(ticket, translation, rotation)
+                if (heard := self._given(ticket)) is not None and self.stopped is not None:
+                    self.stopped, self._state, self._heard = None, None, heard
+            case ["MOVE", ticket, translation, rotation]:
+                self._move(self._given(ticket), number(translation), number(rotation))
             case _:
                 self.stop("malformed")
         return self.state()
-
-    @property
-    def greeting(self) -> str:
-        """The first line to a client: protocol and limits."""
-        numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, *self._limits.travel_mm)
-        return " ".join([PROTOCOL, *(repr(float(value)) for value in numbers)]) + "\n"
 
     def _ticket(self) -> str:
         """Return a new ticket, and forget those that are too old to move anything."""
@@ -204,11 +185,8 @@ class Drive:
 
     def _given(self, ticket: str) -> float | None:
         """Return when a ticket was given, s, or None if it can move nothing."""
-        given = self._tickets.get(ticket)
-        if given is None or self._now >= given + LASTS_S:
-            self.dropped += 1
-            return None
-        return given
+        given = self._tickets.get(ticket, -math.inf)
+        return given if self._now < given + LASTS_S else None
 
     def _advance(self, until: float) -> None:
         if self._wanted is not None:
@@ -312,9 +290,8 @@ def listen(host: str, port: int, named: str = "host, port") -> socket.socket:
 
 async def _obey(drive: Drive, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Answer the lines of a client that showed its certificate, until it is gone; then the drive stops."""
-    drive.open()
+    writer.write(drive.open())
     why = ""
-    writer.write(drive.greeting.encode("ascii"))
     try:
         while not why:
             async with asyncio.timeout(GONE_S):

@@ -101,11 +101,17 @@ class RobotLog:
         arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
         return replace(self, **arrays)
 
-    def from_row(self, first: int) -> RobotLog:
-        """Return the log of one episode from a row on; velocities are summed up from there."""
-        before = self.command[:first][self.commanded[:first]]
-        rest = self.rows(np.arange(len(self)) >= first)
-        return replace(rest, command=rest.command - before[-1]) if self.by_velocity and len(before) else rest
+    def from_first_tip(self) -> RobotLog:
+        """Return the log of one episode from the last command at or before its first tip on, or from its first command;
+        velocities are summed up from there."""
+        commands, seen = np.flatnonzero(self.commanded), int(np.argmax(self.seen))
+        before = max(0, np.searchsorted(commands, seen, side="right") - 1)
+        rest = self.rows(np.arange(len(self)) >= (commands[before] if len(commands) else 0))
+        return (
+            replace(rest, command=rest.command - self.command[commands[before - 1]])
+            if self.by_velocity and before
+            else rest
+        )
 
 
 def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence[str] = ()) -> RobotLog:

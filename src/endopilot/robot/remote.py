@@ -109,13 +109,11 @@ class RemoteRobot(AbstractContextManager["RemoteRobot"]):
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return context.wrap_socket(plain)
         except ssl.SSLCertVerificationError as error:
-            plain.close()
             raise InputError(
                 f"certificates: the drive at {self._where} is not that of {certificates / 'drive.crt'} "
                 f"({error.verify_message}); copy its drive.crt there"
             ) from error
         except OSError as error:
-            plain.close()
             raise InputError(
                 f"host, port: {self._where} begins no TLS 1.3 ({error}); check the address, or try again if too many "
                 "connections wait there"

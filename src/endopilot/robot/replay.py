@@ -130,18 +130,12 @@ def usable_episodes(logs: Sequence[RobotLog], anatomy: Anatomy) -> list[RobotLog
     """Return the episodes that can be replayed, with tips in space, from the last command before the first tip on:
     nobody saw whether the wire followed what a drive did before. InputError where there is none."""
     found = [episode for log in logs for episode in log.in_vessel(anatomy.tree).episodes()]
-    found = [each.from_row(_first_row(each)) for each in found if each.seen.sum() >= LEAST_TIPS]
+    found = [each.from_first_tip() for each in found if each.seen.sum() >= LEAST_TIPS]
     found = [each for each in found if each.commanded.sum() > 1]
     if not found:
         names = ", ".join(log.name for log in logs)
         raise InputError(f"{names}: no episode shows the tip {LEAST_TIPS} times; log longer ones, or mark fewer resets")
     return found
-
-
-def _first_row(log: RobotLog) -> int:
-    """Return the row of the last command at or before the first tip, or of the first command."""
-    commands, first = np.flatnonzero(log.commanded), int(np.argmax(log.seen))
-    return int(commands[max(0, np.searchsorted(commands, first, side="right") - 1)]) if len(commands) else 0
 
 
 @public
