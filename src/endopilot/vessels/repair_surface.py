@@ -128,10 +128,9 @@ def _united(regions: Any, ids: np.ndarray, chosen: int) -> tuple[list[int], Any]
     """Return which closed pieces of a surface overlap one, directly or by others, and the wall of all of them."""
     faces = regions.faces.reshape(-1, 4)[:, 1:]
     own = ids[faces[:, 0]]
-    parts = {
-        int(i): _surface(_capped(_polydata(regions.points, faces[own == i]).clean()))
-        for i in np.argsort(-np.bincount(own))[:MOST_PIECES]
-    } | {chosen: _surface(_capped(_polydata(regions.points, faces[own == chosen]).clean()))}
+    largest = np.argsort(-np.bincount(own))[:MOST_PIECES].tolist()
+    meshes = {i: _polydata(regions.points, faces[own == i]).clean() for i in (*largest, chosen)}
+    parts = {i: _surface(_capped(mesh)) for i, mesh in meshes.items()}
     lower, upper = regions.points.min(axis=0), regions.points.max(axis=0)
     step = max(
         min(abs(part.mean_radius) for part in parts.values()) / 4, float(np.prod(upper - lower)) ** (1 / 3) / _ACROSS
@@ -147,7 +146,7 @@ def _united(regions: Any, ids: np.ndarray, chosen: int) -> tuple[list[int], Any]
                 joined.append(i)
                 union |= inside[i]
     if len(joined) == 1:
-        return joined, _polydata(regions.points, faces[own == chosen]).clean()
+        return joined, meshes[chosen]
     wall = surface_from_mask(Volume(union, np.full(3, step), lower - 4 * step, np.eye(3)))
     return joined, _polydata(wall.vertices, wall.faces)
 

@@ -3,6 +3,7 @@ file decides which reader takes it; that of markups stands here."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -140,13 +141,13 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
         if value is not None and not lower.endswith(MASK_SUFFIXES):
             raise InputError(f"{path}: --{option} {value} was given, but only masks have {option}s; leave it out")
     if path.is_dir():
-        return _read_curves(path)
+        return _read_folder(path)
     if lower.endswith(MASK_SUFFIXES):
         from endopilot.imaging.volume import read_mask  # slow to import
 
         source = AnatomySource(read_mask(path, label=label, threshold=threshold), coordinates="lps")
     elif lower.endswith(".json"):
-        source = _read_markups(path)
+        source = _read_markups([path])
     elif lower.endswith(SURFACE_SUFFIXES):
         from endopilot.vessels.polydata import read_polydata  # slow to import
 
@@ -159,58 +160,52 @@ def read_source(path: str | Path, *, label: int | str | None = None, threshold: 
     return replace(source, file=path.name, sha256=files.input_hash(path, read)[path.name])
 
 
-def _read_curves(folder: Path) -> AnatomySource:
+def _read_folder(folder: Path) -> AnatomySource:
     entries = sorted(folder.iterdir())
     curves = [path for path in entries if path.name.lower().endswith(".mrk.json")]
     if (folder / "anatomy.json").exists():
         raise InputError(f"{folder}: is an anatomy already; give it to the next command, such as `endopilot simulate`")
     if not curves:
         raise InputError(f"{folder}: holds no curves (.mrk.json); give a file or a folder of curves")
-    read = [_read_markups(path) for path in curves]
-    lines = [source.content for source in read if isinstance(source.content, Polylines)]
-    names = [
-        path.name[: -len(".mrk.json")] for path, own in zip(curves, lines, strict=True) for _ in range(len(own.points))
-    ]
-    factors = {source.factor for source in read}
     notes = [f"{len(curves)} files of curves in the folder are the lines of one tree"]
     if len(entries) > len(curves):
         others = ", ".join(path.name for path in entries if path not in curves)
         notes.append(f"beside the curves the folder holds {others}: left out")
-    notes += [f"{path.name}: {note}" for path, source in zip(curves, read, strict=True) for note in source.notes]
+    sha256 = next(iter(files.input_hash(folder, curves).values()))
+    return replace(_read_markups(curves, notes, named=True), file=folder.resolve().name, sha256=sha256)
+
+
+def _read_markups(paths: Sequence[Path], notes: Sequence[str] = (), *, named: bool = False) -> AnatomySource:
+    """Read the curves of files of Slicer's markups, in LPS mm, which may be named by their files; other markups beside
+    them are left out with a note."""
+    lines, names, notes, stated = list[Polylines](), list[str](), list(notes), set[tuple[str, float]]()
+    for path in paths:
+        content = files.read_json(path)
+        markups = content.get("markups") if isinstance(content, dict) else None
+        if not isinstance(markups, list) or not markups or not all(isinstance(markup, dict) for markup in markups):
+            raise InputError(f"{path}: holds no Slicer markups; export the centerline curve as .mrk.json")
+        curves, own, others = [], list[str](), list[str]()
+        for number, markup in enumerate(markups):
+            name, kind = str(markup.get("label") or markup.get("name") or number), str(markup.get("type") or "Curve")
+            if kind.lower() in ("curve", "line"):
+                curves.append(_curve(markup, f"{path}: curve {name!r}", own))
+            else:
+                others.append(f"{kind} {name!r} is no centerline")
+        if not curves:
+            raise InputError(f"{path}: {others[0]}; save it as an open curve (type Curve) in Slicer's Markups module")
+        own += [f"{other}, and is left out" for other in others]
+        lines.append(checked_lines(Polylines(*zip(*(curve[:2] for curve in curves), strict=True)), path, own))
+        names += [path.name[: -len(".mrk.json")]] * len(curves) if named else []
+        notes += [f"{path.name}: {note}" for note in own] if named else own
+        stated |= {curve[2:] for curve in curves}
+    axes, factors = (set(each) for each in zip(*stated, strict=True))
+    points, radius = (tuple(one for own in lines for one in getattr(own, name)) for name in ("points", "radius"))
     return AnatomySource(
-        Polylines(
-            tuple(points for own in lines for points in own.points),
-            tuple(radius for own in lines for radius in own.radius),
-            tuple(names),
-        ),
-        file=folder.resolve().name,
-        sha256=next(iter(files.input_hash(folder, curves).values())),
-        coordinates=" and ".join(sorted({source.coordinates or "lps" for source in read})),
+        Polylines(points, radius, tuple(names)),
+        coordinates=" and ".join(sorted(axes)),
         factor=factors.pop() if len(factors) == 1 else 1.0,
         notes=tuple(notes),
     )
-
-
-def _read_markups(path: Path) -> AnatomySource:
-    """Read the curves of Slicer's markups, in LPS mm; other markups beside them are left out with a note."""
-    content = files.read_json(path)
-    markups = content.get("markups") if isinstance(content, dict) else None
-    if not isinstance(markups, list) or not markups or not all(isinstance(markup, dict) for markup in markups):
-        raise InputError(f"{path}: holds no Slicer markups; export the centerline curve as .mrk.json")
-    curves, notes, others = [], list[str](), list[str]()
-    for number, markup in enumerate(markups):
-        name, kind = str(markup.get("label") or markup.get("name") or number), str(markup.get("type") or "Curve")
-        if kind.lower() in ("curve", "line"):
-            curves.append(_curve(markup, f"{path}: curve {name!r}", notes))
-        else:
-            others.append(f"{kind} {name!r} is no centerline")
-    if not curves:
-        raise InputError(f"{path}: {others[0]}; save it as an open curve (type Curve) in Slicer's Markups module")
-    notes += [f"{other}, and is left out" for other in others]
-    points, radii, axes, factors = zip(*curves, strict=True)
-    lines = checked_lines(Polylines(points, radii), path, notes)
-    factor = factors[0] if len(set(factors)) == 1 else 1.0
-    return AnatomySource(lines, coordinates=" and ".join(sorted(set(axes))), factor=factor, notes=tuple(notes))
 
 
 def _curve(
