@@ -28,6 +28,11 @@ def test_it_stops_200_ms_after_the_last_call_and_goes_on_at_the_next(drive, cert
     _, port = drive
     with RemoteRobot(HOST, port, certificates) as robot:
         assert isinstance(robot, Robot)
+        robot.command(((10.0, 0.0),))  # away from the end of the travel, where going back would stop it
+        robot.run(1.0)
+        while robot.status != "stopped:silence":
+            robot.proximal_state()
+        time.sleep(0.2)
         for speed in (10.0, -10.0, 10.0):
             before = robot.proximal_state()
             robot.command(((speed, 1.0),))

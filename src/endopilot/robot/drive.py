@@ -215,7 +215,13 @@ def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
     where one is missing or holds something else, or the key is encrypted, open to others, or of another certificate."""
     side, other = ("drive", "client") if of_drive else ("client", "drive")
     key, own, trusted = folder / f"{side}.key", folder / f"{side}.crt", folder / f"{other}.crt"
-    mend = f"copy it there, or make both sides' with `{_recipe(folder)}`"
+    place = shlex.quote(str(folder))
+    request = (
+        "openssl req -x509 -newkey rsa:3072 -nodes -days 3650 -subj /CN=$side "
+        f"-keyout {place}/$side.key -out {place}/$side.crt"
+    )
+    recipe = f"mkdir -p {place}; for side in drive client; do {request}; done"
+    mend = f"copy it there, or make both sides' with `{recipe}`"
     for path in (key, own, trusted):
         if not path.is_file():
             raise InputError(f"certificates: {path}: no such file; {mend}")
@@ -235,16 +241,6 @@ def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
         reason = getattr(error, "reason", None) or error.strerror or error
         raise InputError(f"certificates: {what} ({reason}); {mend}") from error
     return context
-
-
-def _recipe(folder: Path) -> str:
-    """Return the shell command that makes a folder with the keys and certificates of both sides."""
-    place = shlex.quote(str(folder))
-    request = (
-        "openssl req -x509 -newkey rsa:3072 -nodes -days 3650 -subj /CN=$side "
-        f"-keyout {place}/$side.key -out {place}/$side.crt"
-    )
-    return f"mkdir -p {place}; for side in drive client; do {request}; done"
 
 
 async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say: Callable[[str], None]) -> None:

@@ -125,16 +125,16 @@ def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence
         table = read_bag(path, topics)
     else:
         table = read_columns(path, ["time_s"], ["episode", "flag"], sparse=[*of_devices, *_TIP, *_PIXEL])
-    devices = max(k + 1 for k, p in enumerate(prefixes) if k == 0 or p + _POSITION[0] in table.values
-                  or p + _VELOCITY[0] in table.values)  # fmt: skip
-    if not {_POSITION[0], _VELOCITY[0]} & table.values.keys():
+    driven = [k for k, p in enumerate(prefixes) if {p + _POSITION[0], p + _VELOCITY[0]} & table.values.keys()]
+    if 0 not in driven:
         raise InputError(
             f"{path}: is no log of a robot: column translation_mm, or translation_mm_s, is missing, where the drive is "
             f"sent; it has {', '.join(table.header[:8])}{' …' if len(table.header) > 8 else ''}"
         )
+    prefixes = prefixes[: driven[-1] + 1]
     table.ascends("time_s", by="time")
     time_s, episode = table.values["time_s"], table.whole("episode")
-    command = np.stack([_command(table, p, time_s, episode) for p in prefixes[:devices]], axis=1)
+    command = np.stack([_command(table, p, time_s, episode) for p in prefixes], axis=1)
     if not np.isfinite(command[:, 0, 0]).any():
         raise InputError(f"{path}: translation_mm: holds no command; give one")
     pixel = _group(table, "", _PIXEL)
@@ -150,8 +150,8 @@ def read_log(path: Path | str, *, camera: Camera | None = None, topics: Sequence
         time_s=time_s,
         episode=episode,
         command=command,
-        encoders=np.stack([_group(table, p, _ENCODER) for p in prefixes[:devices]], axis=1),
-        load=np.stack([_group(table, p, _LOAD) for p in prefixes[:devices]], axis=1),
+        encoders=np.stack([_group(table, p, _ENCODER) for p in prefixes], axis=1),
+        load=np.stack([_group(table, p, _LOAD) for p in prefixes], axis=1),
         tip=_group(table, "", _TIP),
         pixel=pixel,
         used=table.whole("flag") == 0,

@@ -36,11 +36,10 @@ class RemoteRobot(AbstractContextManager["RemoteRobot"]):
         """Connect and arm the drive, with `client.key`, `client.crt` and `drive.crt` of a folder. InputError where a
         file is missing or bad, nothing listens there, or what does is another drive, does not know this client, or has
         one."""
-        context = tls_context(Path(certificates), of_drive=False)
         self._where, self._lock = f"{host}:{port}", threading.RLock()
         self._lost, self.status = "", "stopped:start"
         self._ticket, self._wanted, self._closing = "", (0.0, 0.0), threading.Event()
-        self._socket = self._connect(host, port, context, Path(certificates))
+        self._socket = self._connect(host, port, Path(certificates))
         self._lines = self._socket.makefile("rb")
         try:
             self.limits = self._greet(Path(certificates))
@@ -95,10 +94,10 @@ class RemoteRobot(AbstractContextManager["RemoteRobot"]):
         self._closing.set()
         with self._lock:
             self._lose("it was closed")
-        if threading.current_thread() is not self._living:
-            self._living.join()
+        self._living.join()
 
-    def _connect(self, host: str, port: int, context: ssl.SSLContext, certificates: Path) -> ssl.SSLSocket:
+    def _connect(self, host: str, port: int, certificates: Path) -> ssl.SSLSocket:
+        context = tls_context(certificates, of_drive=False)
         try:
             plain = socket.create_connection((host, port), timeout=ANSWER_S)
         except (OSError, OverflowError, UnicodeError) as error:
@@ -157,7 +156,6 @@ class RemoteRobot(AbstractContextManager["RemoteRobot"]):
             if self._lost:
                 raise self._gone()
             try:
-                self._socket.settimeout(ANSWER_S)
                 self._socket.sendall(" ".join([verb, *arguments]).encode("ascii") + b"\n")
                 fields = self._line().split(" ")
                 values = [value for value in map(number, fields[1:6]) if value is not None]

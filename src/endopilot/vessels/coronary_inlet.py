@@ -22,10 +22,10 @@ from endopilot.vessels.coronary_ostia import (
     find_crux,
     rank_ostia,
 )
-from endopilot.vessels.ends import OpenEnd, Skeleton, open_ends, skeleton_of
+from endopilot.vessels.ends import Skeleton, open_ends, skeleton_of
 from endopilot.vessels.inlet import AORTA_RADIUS_MM
 from endopilot.vessels.sources import check_unit
-from endopilot.vessels.surface import Surface, distance_map_from_surface, filled_box, surface_from_mask
+from endopilot.vessels.surface import Surface, cropped, distance_map_from_surface, surface_from_mask
 
 CERTAIN = 0.8  # an ostium less probable than this is asked for
 PRESENT = 0.5  # the other artery is in the lumen if it begins in another piece with at least this probability
@@ -65,7 +65,6 @@ def coronary_inlet(
     """Return where an artery begins, or None where a piece of the aorta in the lumen shows it; `coordinates` are axes
     that the user gave. Raises InputError, which names what to give, for an absent or uncertain artery, or other axes.
     """
-    pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []
     coarse = content.volume if isinstance(content, LumenMask) else content
     if isinstance(content, LumenMask) and content.volume.voxels.any():
@@ -75,19 +74,17 @@ def coronary_inlet(
             return None
         coarse = _coarse(repair.pieces_of(content.volume).parted)
     for lumen in _lumens(coarse, label):
-        inside = lumen.values > 0
-        for points, clearance in _parts(lumen, inside):
+        for points, clearance in _parts(lumen):
             if clearance.max() > AORTA_RADIUS_MM:
                 return None
-            skeleton = skeleton_of(points, clearance, lumen.spacing_mm)
-            if skeleton.costs.sum() >= SHORTEST_MM:
-                pieces.append(open_ends(skeleton))
-                skeletons.append(skeleton)
-    if not pieces:
+            skeletons.append(skeleton_of(points, clearance, lumen.spacing_mm))
+    skeletons = [skeleton for skeleton in skeletons if skeleton.costs.sum() >= SHORTEST_MM]
+    if not skeletons:
         raise InputError(
             f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit (cm: --scale 10)"
         )
     vessels = np.concatenate([skeleton.points[::_EVERY] for skeleton in skeletons])
+    pieces = [open_ends(skeleton) for skeleton in skeletons]
     rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
     ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]
     best, other = ranking.candidates[0], counterpart.candidates[0]
@@ -147,8 +144,8 @@ def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:
         yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
 
 
-def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]]:
-    labels = connected_components(inside, corners=True)
+def _parts(lumen: DistanceMap) -> Iterator[tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]]:
+    labels = connected_components(lumen.values > 0, corners=True)
     for number, box in enumerate(find_objects(labels), start=1):
         own = labels[box] == number
         corner = np.array([part.start for part in box])
@@ -169,19 +166,13 @@ def _holds_aorta(coarse: Volume) -> bool:
 
 def _coarse(mask: Volume) -> Volume:
     """Return a mask cropped to what is in it, of voxels no finer than the ostia are looked for at."""
-    box = filled_box(mask.voxels)
-    if box[0].stop == 0:
-        return mask
-    corner = np.array([part.start for part in box])
-    voxels = mask.voxels[box]
+    mask, _ = cropped(mask)
     factor = np.maximum(np.floor(GRID_MM / mask.spacing_mm + 0.2).astype(int), 1)
-    origin = mask.index_to_world(corner[::-1].astype(float))
-    cropped = replace(mask, voxels=np.asarray(voxels, dtype=bool), origin_mm=origin)
     if (factor == 1).all():
-        return cropped
+        return mask
     from skimage.measure import block_reduce
 
     block = tuple(int(size) for size in factor[::-1])
-    shares = block_reduce(cropped.voxels.astype(np.float32), block, np.mean)  # pyright: ignore[reportArgumentType]
-    origin = cropped.index_to_world((factor - 1) / 2.0)
+    shares = block_reduce(mask.voxels.astype(np.float32), block, np.mean)  # pyright: ignore[reportArgumentType]
+    origin = mask.index_to_world((factor - 1) / 2.0)
     return replace(mask, voxels=shares >= 0.5, spacing_mm=mask.spacing_mm * factor, origin_mm=origin)

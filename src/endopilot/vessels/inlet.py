@@ -81,12 +81,11 @@ def beyond_parent(
     ostium = None if parent is None else _ostium_beyond(coarse, within, parent, graph, side)
     if parent is None or ostium is None:
         return None, inside
-    index = np.argwhere(inside)
-    places = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
+    places, _ = grid_points(distance_map, inside)
     nearest = np.rint((places - coarse.origin_mm) / coarse.spacing_mm).astype(int)[:, ::-1]
     nearest = np.clip(nearest, 0, np.array(parent.shape) - 1)
     beyond = inside.copy()
-    beyond[tuple(index.T)] = ~parent[tuple(nearest.T)]
+    beyond[inside] = ~parent[tuple(nearest.T)]
     labels = connected_components(beyond, corners=True)
     return ostium, part_at(distance_map, labels, ostium)
 

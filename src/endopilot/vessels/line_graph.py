@@ -183,17 +183,15 @@ def _outside_parent_vessel(graph: LineGraph) -> tuple[Bool[np.ndarray, "n"], Flo
     spheres = np.flatnonzero(big)
     # Lines that overlap repeat the parent's spheres: one in each cell of the step is enough.
     spheres = spheres[np.unique(np.floor(points[spheres] / STEP_MM), axis=0, return_index=True)[1]]
-    within = np.zeros(len(points), dtype=bool)
+    within = big.copy()
     for found in KDTree(points).query_ball_point(points[spheres], radius[spheres]):
         within[found] = True
-    keep = everywhere.copy()
-    first_kept = []
-    for start, end in zip(starts, [*starts[1:], len(points)], strict=True):
-        inside = np.flatnonzero(within[start:end] | big[start:end])
+    keep, first_kept = everywhere.copy(), list[int]()
+    for own in split(np.arange(len(points)), owner):
+        inside = np.flatnonzero(within[own])
         leave = int(inside[-1]) + 1 if len(inside) else 0
-        keep[start : start + leave] = False
-        if start + leave < end:
-            first_kept.append(start + leave)
+        keep[own[:leave]] = False
+        first_kept += own[leave : leave + 1].tolist()
     if not first_kept:
         return everywhere, None
     close = np.ptp(points[first_kept], axis=0).max() < 2.0

@@ -3,6 +3,7 @@ and the centerlines' grid, it is the yardstick of what these show and reach."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -159,11 +160,9 @@ def _traced_piece(
             start = int(np.flatnonzero(gap < _NEIGHBOURS_APART)[-1])
             joint = int(nearest[start])
             start += int(gap[start] == 0)
-        for node in path[start:]:
-            nodes.append(int(node))
-            if joint >= 0:
-                pairs.append((joint, len(nodes) - 1))
-            joint = len(nodes) - 1
+        new = range(len(nodes), len(nodes) + len(path) - start)
+        pairs += itertools.pairwise(new if joint < 0 else [joint, *new])
+        nodes += path[start:].tolist()
     return places[nodes], graph.radius[nodes], np.array(pairs, dtype=int).reshape(-1, 2)
 
 

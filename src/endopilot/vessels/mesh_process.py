@@ -16,11 +16,8 @@ def read(path: str) -> dict[str, np.ndarray]:
     """Return a mesh file's arrays by name, with VTK's complaints; outside its own process, of whole files alone."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
-    window, before, level = (
-        vtkStringOutputWindow(),
-        vtkOutputWindow.GetInstance(),
-        vtkLogger.GetCurrentVerbosityCutoff(),
-    )
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    level = vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     vtkOutputWindow.SetInstance(window)
     try:

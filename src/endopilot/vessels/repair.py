@@ -17,7 +17,7 @@ from endopilot.vessels.graph import split
 from endopilot.vessels.inlet import COMPARABLE, Vessel, piece_on_side
 from endopilot.vessels.medial_lines import MedialLines, piece_labels
 from endopilot.vessels.remarks import NOTED_MM, longest_first
-from endopilot.vessels.surface import filled_box
+from endopilot.vessels.surface import cropped
 from endopilot.vessels.topology import SMALLEST_PIECE, Touch, parted, touch_remarks
 
 NEAR_OSTIUM_MM = 5.0  # a lumen farther than this from a given ostium does not belong to it
@@ -55,10 +55,9 @@ class Pieces:
 @lru_cache(maxsize=1)
 def pieces_of(mask: Volume) -> Pieces:
     """Return the pieces of a mask that holds some; the last mask's are kept: several stages ask for them."""
-    box = filled_box(mask.voxels)
-    origin = mask.index_to_world(np.array([part.start for part in box][::-1], dtype=float))
-    joined, gaps = _joined(np.asarray(mask.voxels[box], dtype=bool))
-    read = replace(mask, voxels=joined, origin_mm=origin)
+    own, _ = cropped(mask)
+    joined, gaps = _joined(own.voxels)
+    read = replace(own, voxels=joined)
     return Pieces(read, gaps, *parted(read))
 
 
@@ -78,7 +77,7 @@ def connected_mask(
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
     if mask.voxels.all():
         raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
-    _refuse_blocks_and_noise(np.asarray(mask.voxels[filled_box(mask.voxels)], dtype=bool), label)
+    _refuse_blocks_and_noise(cropped(mask)[0].voxels, label)
     whole = pieces_of(mask)
     labels, read = piece_labels(whole.parted), piece_labels(whole.joined)
     index = np.argwhere(whole.parted.voxels)
@@ -102,14 +101,12 @@ def connected_mask(
     if joints.count(True):
         remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
     remarks += pieces_left_out(pieces, [main], severed, vessel, "voxels")
-    box = filled_box(result)
-    corner = np.array([part.start for part in box])
-    closed = _filled(result[box])
+    lumen, corner = cropped(replace(whole.joined, voxels=result))
+    closed = _filled(lumen.voxels)
     if closed.sum() > sizes[main]:
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
-    lumen = replace(mask, voxels=closed, origin_mm=whole.joined.index_to_world(corner[::-1].astype(float)))
     lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
-    return Lumen(lumen, lines, remarks)
+    return Lumen(replace(lumen, voxels=closed), lines, remarks)
 
 
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Literal
 
@@ -211,6 +211,14 @@ def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slic
     return (box[0], box[1], box[2])
 
 
+def cropped(mask: Volume) -> tuple[Volume, Int[np.ndarray, "3"]]:
+    """Return the smallest box of a mask that holds what is in it, and the voxel (z, y, x) that it begins at."""
+    box = filled_box(mask.voxels)
+    corner = np.array([part.start for part in box])
+    origin = mask.index_to_world(corner[::-1].astype(float))
+    return replace(mask, voxels=np.asarray(mask.voxels[box], dtype=bool), origin_mm=origin), corner
+
+
 def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Return the standard deviation in voxels of the Gaussian along each axis, for voxels with these edges in mm."""
     return SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
@@ -220,9 +228,8 @@ def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 def smooth_level(mask: Volume) -> tuple[Float[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
     """Return the `level_function` of a mask on its filled box and a margin, and the voxel (z, y, x) it begins at. The
     last mask's is kept: what it is too thin to show is looked for before the wall is made of it."""
-    margin, box = 4, filled_box(mask.voxels)
-    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
-    return level_function(inside, mask.spacing_mm[::-1]), np.array([part.start for part in box]) - margin
+    margin, (own, corner) = 4, cropped(mask)
+    return level_function(np.pad(own.voxels, margin), mask.spacing_mm[::-1]), corner - margin
 
 
 def level_function(

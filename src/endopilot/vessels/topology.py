@@ -11,7 +11,6 @@ its openings stay.
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -241,26 +240,23 @@ def _rings(lines: MedialLines, mask: Volume) -> list[_Ring]:
 
 def _crossings(lines: MedialLines, rings: list[_Ring]) -> Iterator[_Crossing]:
     """Yield where two vessels may run past each other: four arms of one junction, or of two that are near."""
-    segments = _segments(lines, rings)
-    ends = Counter(node for segment in segments for node in (segment[0], segment[-1]))
-    length = [float(length_along(lines.local[segment])[-1]) for segment in segments]
-    forks = [ends[segment[0]] > 2 and ends[segment[-1]] > 2 for segment in segments]
-    radius = [float(lines.radius[[segment[0], segment[-1]]].max()) for segment in segments]
-    inner = [fork and size <= wide for fork, size, wide in zip(forks, length, radius, strict=True)]
-    short = np.array([(s[0], s[-1]) for s, within in zip(segments, inner, strict=True) if within], int).reshape(-1, 2)
-    group = pieces(short, len(lines.points))
+    segments, count = _segments(lines, rings), len(lines.points)
+    ends = np.array([(segment[0], segment[-1]) for segment in segments], dtype=int).reshape(-1, 2)
+    length = np.array([length_along(lines.local[segment])[-1] for segment in segments])
+    radius = lines.radius[ends].max(axis=1)
+    at_fork = (np.bincount(ends.ravel(), minlength=count) > 2)[ends]
+    link, inner = at_fork.all(axis=1), at_fork.all(axis=1) & (length <= radius)
+    group = pieces(ends[inner], count)[ends]
     arms: dict[int, list[tuple[int, _Arm | None]]] = {}
-    for number, segment in enumerate(segments):
-        for path in () if inner[number] else (segment, segment[::-1]):
-            if ends[path[0]] > 2:
-                arms.setdefault(int(group[path[0]]), []).append((number, _arm(lines, path)))
+    for number in np.flatnonzero(~inner).tolist():
+        for own, fork, way in zip(group[number].tolist(), at_fork[number], (1, -1), strict=True):
+            if fork:
+                arms.setdefault(own, []).append((number, _arm(lines, segments[number][::way])))
+    link &= ~inner & (group[:, 0] != group[:, 1]) & (length < _NEAR_RADII * radius)
     unions = [(own, -1) for own in arms.values()]
-    for number, segment in enumerate(segments):
-        one, two = int(group[segment[0]]), int(group[segment[-1]])
-        if forks[number] and not inner[number] and one != two and length[number] < _NEAR_RADII * radius[number]:
-            unions.append((arms[one] + arms[two], number))
-    for union, link in unions:
-        usable = [arm for number, arm in union if number != link and arm is not None]
+    unions += [(arms[group[number, 0]] + arms[group[number, 1]], number) for number in np.flatnonzero(link)]
+    for union, between in unions:
+        usable = [arm for number, arm in union if number != between and arm is not None]
         if len(usable) > 3 and (crossing := _crossing(usable)):
             yield crossing
 
