@@ -37,13 +37,18 @@ _UNIT = re.compile(r"\bUNITS?\s*[=:]\s*[\"']?([A-Za-zµμ]+)", re.IGNORECASE)
 
 _FEWEST_BYTES = 16  # no format holds a vessel in fewer bytes
 
+_ASCII_STL = re.compile(r"\s*solid.*(facet|endsolid)", re.IGNORECASE | re.DOTALL)
+"""How an STL of text begins: a binary one may begin with "solid" too, but no facet follows."""
+
 _ELEMENT = re.compile(r"^element (\w+) (-?\d+)\s*$", re.MULTILINE)
 
 
 def read_polydata(path: Path) -> AnatomySource:
     """Read a surface, or centerlines with radii, in LPS mm where the header states axes and unit. Raises InputError for
     a damaged file, one that is neither, centerlines without radii, or axes other than LPS and RAS."""
-    promised = _promised_faces(path)
+    with path.open("rb") as stream:
+        head = stream.read(_HEADER_BYTES)
+    promised = _promised_faces(path, head)
     data = arrays(path)
     notes: list[str] = []
     points, lines = data["points"], data["line_points"]
@@ -52,8 +57,7 @@ def read_polydata(path: Path) -> AnatomySource:
     _check_whole(path, "polygons", promised, len(data.get("corners", ())))
     if not np.isfinite(points).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; export it again")
-    with path.open("rb") as stream:
-        statement = f"{stream.read(_HEADER_BYTES).decode('latin-1')}\n{data['fields']}"
+    statement = f"{head.decode('latin-1')}\n{data['fields']}"
     coordinates = _coordinates(statement, path)
     factor, odds = _factor(statement, notes)
     if "corners" in data:
@@ -159,16 +163,14 @@ def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
     )
 
 
-def _promised_faces(path: Path) -> int:
+def _promised_faces(path: Path, head: bytes) -> int:
     """Return how many polygons a PLY's header promises: those that are missing at its end VTK leaves out unsaid. Raises
     InputError for a file that is empty, or shorter than what its header promises takes at least."""
     size = path.stat().st_size
     if size < _FEWEST_BYTES:
         raise InputError(f"{path}: is empty or truncated; export it again")
-    with path.open("rb") as stream:
-        head = stream.read(_HEADER_BYTES)
     text, kind = head.decode("latin-1"), path.suffix.lower()
-    if kind == ".stl" and not _is_ascii_stl(text[:1024]):
+    if kind == ".stl" and not _ASCII_STL.match(text[:1024]):
         _check_whole(path, "triangles", int.from_bytes(head[80:84], "little"), (size - 84) // 50)
     if kind != ".ply":
         return 0
@@ -184,8 +186,3 @@ def _check_whole(path: Path, what: str, promised: int, held: int) -> None:
         raise InputError(
             f"{path}: is truncated: its header promises {promised} {what}, and it holds {max(held, 0)}; export it again"
         )
-
-
-def _is_ascii_stl(text: str) -> bool:
-    """Return whether an STL file is text: binary ones may begin with "solid" too, but no facet follows."""
-    return text.lstrip().lower().startswith("solid") and ("facet" in text.lower() or "endsolid" in text.lower())

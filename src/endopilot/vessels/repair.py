@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_fill_holes, distance_transform_edt
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError, place_text
@@ -102,7 +102,7 @@ def connected_mask(
         remarks.append(f"{joints.count(True)} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
     remarks += pieces_left_out(pieces, [main], severed, vessel, "voxels")
     lumen, corner = cropped(replace(whole.joined, voxels=result))
-    closed = _filled(lumen.voxels)
+    closed = np.asarray(binary_fill_holes(lumen.voxels), dtype=bool)
     if closed.sum() > sizes[main]:
         remarks.append(f"cavities of {int(closed.sum() - sizes[main])} voxels filled")
     lines = whole.lines.within(result[tuple(whole.lines.index.T)], corner)
@@ -112,11 +112,6 @@ def connected_mask(
 def _holds(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"], place: Float[np.ndarray, "3"]) -> bool:
     at = np.rint(mask.world_to_index(place)).astype(int)[::-1]
     return bool(voxels[tuple(slice(max(0, i - 2), i + 3) for i in at)].any())
-
-
-def _filled(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
-    outside = connected_components(np.pad(~voxels, 1, constant_values=True))
-    return (outside != outside[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
 def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -> None:
