@@ -23,7 +23,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import wire_points
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.image import ImageConfig, Plane
-from endopilot.xray.projector import splat
+from endopilot.xray.projector import Shadow
 from endopilot.xray.registration import register
 
 ANGLES = (((-30.0, 0.0), (60.0, 0.0)), ((-20.0, 25.0), (45.0, 20.0)), ((0.0, -30.0), (90.0, 0.0)))
@@ -206,7 +206,7 @@ def metal_points(
 def with_metal(plane: Plane, points: Float[np.ndarray, "n 3"], sizes: Float[np.ndarray, "n"]) -> Plane:
     """Return what does not move in a view, with metal of `metal_points`."""
     pixels = len(plane.background)
-    shadow = splat(plane.view, pixels, place(plane.placed, points), sizes, blur_px=_METAL_PX * plane.zoom)
+    shadow = Shadow(plane.view, pixels, place(plane.placed, points)).of(sizes, blur_px=_METAL_PX * plane.zoom)
     return replace(plane, background=plane.background + shadow)
 
 

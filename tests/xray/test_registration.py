@@ -10,8 +10,8 @@ import pytest
 from benchmarks.imaging.xray import vessel_error_mm
 from endopilot.simulation.motion import Motion, draw_motion, motion_named, place, published_mean
 from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.fluoroscope import seen_in_episodes, turned
 from endopilot.xray.image import XrayImager
-from endopilot.xray.moving_patient import seen_in_episodes, turned
 from endopilot.xray.registration import register
 
 ANGLES = ((-30.0, 0.0), (60.0, 0.0))

@@ -20,7 +20,7 @@ from endopilot.simulation.motion import place, relative
 from endopilot.xray.absorbers import GUIDE_WALL_MM, catheter_line, in_catheter, is_coronary
 from endopilot.xray.carm import View, view_at, view_of
 from endopilot.xray.image import XrayImager
-from endopilot.xray.projector import Shadow, splat
+from endopilot.xray.projector import Shadow
 
 CLASSES: Mapping[str, int] = {"vessel": 1, "contrast": 2, "guide": 4, "catheter": 8, "wire": 16}
 """Names of the masks, and their bits in a mask's file: vessel (its whole lumen), contrast (where half of the blood on
@@ -305,10 +305,10 @@ class Cine:
             masks["contrast"] = masks["vessel"] & (path > CONTRAST_SHARE * lumen)
             if draw.injection is not None:
                 if number / config.frames_per_second > draw.injection.start_s:  # saline fills the catheter before
-                    path += imager.guide_lumen(self.view, 1.0, placed)
+                    path += imager.cloud("guide lumen", self.view, 1.0, placed)
                 volume = self._reflux_mm3[number] / _REFLUX
-                path += splat(self.view, config.image.pixels, reflux, volume, placed=placed, width_mm=_REFLUX_MM / 2)
-            background = patient + GUIDE * imager.guide(self.view, 1.0, placed)
+                path += Shadow(self.view, config.image.pixels, reflux, placed).of(volume, width_mm=_REFLUX_MM / 2)
+            background = patient + GUIDE * imager.cloud("guide", self.view, 1.0, placed)
             plane = replace(first, background=background, vessel_mm=path, placed=placed)
             lines, was = self.driven.nodes[number], relative(self._before[number], placed)
             moving = [

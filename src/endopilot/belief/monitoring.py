@@ -31,9 +31,8 @@ from endopilot.settings import NonNegative, Seed, settings
 from endopilot.simulation.motion import place, published_mean
 from endopilot.tasks.navigation import Navigation, Target, XrayKind, is_safe
 from endopilot.types import SAMPLE_PERIOD_S
-from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, make_c_arm
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, make_c_arm, seen_in_episodes, turned
 from endopilot.xray.image_fluoroscope import NotRegistered
-from endopilot.xray.moving_patient import seen_in_episodes, turned
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""

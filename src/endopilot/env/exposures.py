@@ -17,9 +17,8 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import view_at
-from endopilot.xray.fluoroscope import FluoroscopeConfig, TipFinder
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipFinder, seen, turned
 from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
-from endopilot.xray.moving_patient import seen, turned
 
 _FULL_PIXELS = ImageConfig().pixels
 """Of the house's detector; a coarser one has fewer and larger pixels on the same square."""

@@ -1,6 +1,6 @@
 """What takes away X-rays: the patient, the lumen with its contrast, the guiding catheter, the wire and its catheters.
 
-Each but the patient is a cloud of small volumes, which `projector.splat` turns into line integrals.
+Each but the patient is a cloud of small volumes, which `projector.Shadow` turns into line integrals.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from endopilot.lines import length_along, places_on
 from endopilot.phantom.chest import is_left
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Anatomy, Volume
+from endopilot.xray.carm import Places
 
 WATER_MM = 0.0206
 """Attenuation of water at 60 keV, the mean energy of fluoroscopy's beam, 1/mm (NIST XCOM)."""
@@ -41,8 +42,6 @@ _MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
 SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
 )
-
-Places = Float[np.ndarray, "n 3"]
 
 
 def is_coronary(anatomy: Anatomy) -> bool:

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from endopilot.files import read_yaml
 from endopilot.settings import Finite, Within, read_settings, settings
 from endopilot.types import VesselTree
-from endopilot.xray.carm import CArmGeometry, View, view_at
+from endopilot.xray.carm import CArmGeometry, Places, View, view_at
 
 CAMERA_FILE = "camera.yaml"
 """Name of the camera's file beside a log."""
@@ -54,7 +54,7 @@ class PlanarCamera:
         """Return column and row, pixels, of points, LPS mm."""
         return (points - self.origin_mm) @ np.array([self.columns, self.rows]).T / self.mm_per_pixel
 
-    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Places, Places]:
         """Return a point, LPS mm, on what each pixel shows, and the unit vector along it."""
         through = np.array(self.origin_mm) + self.mm_per_pixel * pixels @ np.array([self.columns, self.rows])
         return through, np.broadcast_to(np.cross(self.columns, self.rows), through.shape)
@@ -120,7 +120,7 @@ class CArmCamera:
         """Return column and row, pixels, of points, LPS mm."""
         return self.view.project(points) * [1.0, -1.0] + self._centre
 
-    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> tuple[Places, Places]:
         """Return a point, LPS mm, on what each pixel shows, and the unit vector along it."""
         view = self.view
         across = (pixels - self._centre) * [1.0, -1.0] / view.scale
@@ -146,7 +146,7 @@ def read_camera(path: Path) -> Camera:
     return read_settings(path, PlanarCamera)
 
 
-def points_in_vessel(camera: Camera, pixels: Float[np.ndarray, "n 2"], tree: VesselTree) -> Float[np.ndarray, "n 3"]:
+def points_in_vessel(camera: Camera, pixels: Float[np.ndarray, "n 2"], tree: VesselTree) -> Places:
     """Return what pixels show if it lies in a vessel: on each one's ray the point nearest to a centerline, LPS mm.
 
     NaN stays NaN. Where two branches cover each other in the image, it is that which lies nearer to the ray.

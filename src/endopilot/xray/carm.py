@@ -6,13 +6,17 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
 from endopilot.settings import Within, settings
 from endopilot.simulation.motion import place
 
+Vector = Float[np.ndarray, "3"]
+Places = Float[np.ndarray, "n 3"]
+Image = Float32[np.ndarray, "rows columns"]
+"""A point or a direction, LPS; some points, LPS mm; and what there is at each pixel: light, attenuation, evidence."""
 _Distance = Annotated[float, Within(100, 5000, unit="mm", mistaken=(("m", 1000.0), ("cm", 10.0)))]
 
 
@@ -46,8 +50,8 @@ class Pose:
         translation_mm: after the rotation, LPS mm.
     """
 
-    rotation_rad: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    translation_mm: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    rotation_rad: Vector = field(default_factory=lambda: np.zeros(3))
+    translation_mm: Vector = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def of_vector(cls, values: Float[np.ndarray, "6"]) -> Pose:
@@ -62,14 +66,14 @@ class Pose:
     @classmethod
     def draw(cls, random: np.random.Generator, translation_mm: float = 5.0, rotation_deg: float = 3.0) -> Pose:
         """Draw a pose: each length and each angle evenly up to these bounds on either side, mm and degrees."""
-        angles, lengths = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
+        angles, lengths = random.uniform(-1, 1, (2, 3))
         return cls(np.deg2rad(rotation_deg) * angles, translation_mm * lengths)
 
-    def move(self, points: Float[np.ndarray, "*n 3"], isocenter: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n 3"]:
+    def move(self, points: Float[np.ndarray, "*n 3"], isocenter: Vector) -> Float[np.ndarray, "*n 3"]:
         """Return where points of the CT, LPS mm, lie in the C-arm's frame."""
         return place(self.affine(isocenter), points)
 
-    def affine(self, isocenter: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
+    def affine(self, isocenter: Vector) -> Float[np.ndarray, "3 4"]:
         """Return the map that `move` applies."""
         matrix = Rotation.from_rotvec(self.rotation_rad).as_matrix()
         return np.column_stack([matrix, isocenter + self.translation_mm - matrix @ isocenter])
@@ -85,7 +89,7 @@ class View:
         scale: of a point at distance 1 from the source, pixels.
     """
 
-    source: Float[np.ndarray, "3"]
+    source: Vector
     axes: Float[np.ndarray, "3 3"]
     scale: float
 
@@ -102,25 +106,21 @@ class View:
         """Return the view with an image that is magnified by a factor."""
         return replace(self, scale=self.scale * factor)
 
-    def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
+    def slope(self, point: Vector) -> Float[np.ndarray, "2 3"]:
         """Return the derivative of the pixel by the point, pixels/mm."""
-        return self.slopes(point[None])[0]
-
-    def slopes(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
-        """Return the derivatives of the pixels by the points, pixels/mm."""
-        in_view = (points - self.source) @ self.axes.T
-        away = in_view[:, :2, None] / in_view[:, 2:, None]
-        return (self.scale / in_view[:, 2])[:, None, None] * (self.axes[:2] - away * self.axes[2])
+        (in_view,) = (point[None] - self.source) @ self.axes.T
+        away = in_view[:2, None] / in_view[2]
+        return self.scale / in_view[2] * (self.axes[:2] - away * self.axes[2])
 
 
-def view_of(view: View, pose: Pose, isocenter: Float[np.ndarray, "3"]) -> View:
+def view_of(view: View, pose: Pose, isocenter: Vector) -> View:
     """Return a view, given in the C-arm's frame, in the CT's frame of a patient who lies in a pose."""
     matrix = Rotation.from_rotvec(pose.rotation_rad).as_matrix()
     source = (view.source - isocenter - pose.translation_mm) @ matrix + isocenter
     return replace(view, source=source, axes=view.axes @ matrix)
 
 
-def view_at(angles_deg: tuple[float, float], isocenter: Float[np.ndarray, "3"], geometry: CArmGeometry) -> View:
+def view_at(angles_deg: tuple[float, float], isocenter: Vector, geometry: CArmGeometry) -> View:
     """Return the view under an LAO and a cranial angle: at 0, 0 the beam goes from the back to the front, along −y.
 
     Args:

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_laplace
 from endopilot.errors import InputError
 from endopilot.files import regular
 from endopilot.xray.camera import CArmCamera, read_camera
-from endopilot.xray.carm import CArmGeometry, View, view_at
+from endopilot.xray.carm import CArmGeometry, Image, Vector, View, view_at
 from endopilot.xray.image import ImageConfig
 
 _TAGS = {
@@ -59,7 +59,7 @@ class XrayCine:
     camera: CArmCamera
     notes: tuple[str, ...]
 
-    def view(self, isocenter: Float[np.ndarray, "3"]) -> View:
+    def view(self, isocenter: Vector) -> View:
         """Return source and detector, if the C-arm turns about this point, LPS mm; a matrix says it by itself."""
         if self.camera.matrix is not None:
             return self.camera.view
@@ -127,7 +127,7 @@ def read_cine(paths: tuple[Path, ...] | Path, *, c_arm: Path | None = None) -> X
     return XrayCine(path, light - np.float32(np.median(light)), times_s, camera, (*notes, *square))
 
 
-def _png(path: Path) -> Float32[np.ndarray, "rows columns"]:
+def _png(path: Path) -> Image:
     from PIL import Image, UnidentifiedImageError  # slow to import
 
     try:

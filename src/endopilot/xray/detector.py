@@ -23,14 +23,13 @@ from endopilot.devices.device import Wire
 from endopilot.files import read_json
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
-from endopilot.xray.carm import View
-from endopilot.xray.projector import splat
+from endopilot.xray.carm import Image, Places, View
+from endopilot.xray.projector import Shadow
 from endopilot.xray.tip_posterior import TipEstimate, Told, estimated
 from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
 from endopilot.xray.wire_end import BLUR_PX, refined
 from endopilot.xray.wire_likelihood import Seat, Shifts, end_log, or_folded, possible_shifts, tell, way_to
 
-Signal = Float32[np.ndarray, "rows columns"]
 Line = Bool[np.ndarray, "rows columns"]
 SCALES_PX = (1.0, 1.7, 2.8)
 """Standard deviations of the Gaussians whose second derivatives are taken; a coronary wire is some 1.7 pixels wide."""
@@ -40,7 +39,7 @@ _MOST = 12.0
 PARAMETERS = Path(__file__).parent / "ridge.json"
 
 
-def ridge_evidence(signal: Signal, photons: float, rough: Signal | float = 0.0) -> Signal:
+def ridge_evidence(signal: Image, photons: float, rough: Image | float = 0.0) -> Signal:
     """Return the logarithm of how much likelier each pixel is on a wire than off it: a logistic regression on ridges.
 
     Of `features`, whose arguments these are, and the products of any two.
@@ -59,7 +58,7 @@ def _trained() -> tuple[Float[np.ndarray, "terms"], float]:
     return np.array(found["weight"]), float(found["offset"])
 
 
-def features(signal: Signal, photons: float, rough: Signal | float = 0.0) -> Float32[np.ndarray, "f n"]:
+def features(signal: Image, photons: float, rough: Image | float = 0.0) -> Float32[np.ndarray, "f n"]:
     """Return the features of the flat image's pixels: ridges and darkness over the noise, and that.
 
     A pixel of usual brightness counts so many photons; `rough` is the standard deviation of the coarsest ridges that
@@ -79,7 +78,7 @@ def features(signal: Signal, photons: float, rough: Signal | float = 0.0) -> Flo
     return np.clip(found, -_MOST, _MOST, out=found)
 
 
-def _curvatures(image: Signal) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+def _curvatures(image: Image) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
     """Return the mean of the two principal curvatures of the flat image's pixels, and half their difference."""
     (rows, columns), padded = image.shape, np.pad(image, 2, mode="edge")
 
@@ -92,7 +91,7 @@ def _curvatures(image: Signal) -> tuple[Float32[np.ndarray, "n"], Float32[np.nda
     return 0.125 * (down + right), 0.125 * np.sqrt((down - right) ** 2 + 4 * mixed**2)
 
 
-def _smoother(image: Signal, done_px: float, scale_px: float) -> Signal:
+def _smoother(image: Image, done_px: float, scale_px: float) -> Signal:
     """Return an image, smoothed already, smoothed to a larger standard deviation: every other pixel will do."""
     rows, columns = image.shape
     part = gaussian_filter(image[::2, ::2], 0.5 * float(np.sqrt(scale_px**2 - done_px**2)))
@@ -157,8 +156,8 @@ class Exposure(NamedTuple):
     """
 
     views: Sequence[View]
-    plain: Sequence[Signal]
-    evidence: Sequence[Signal]
+    plain: Sequence[Image]
+    evidence: Sequence[Image]
     lines: Sequence[Line]
     shifts: Shifts
     way: Float[np.ndarray, "places shifts"]
@@ -182,7 +181,7 @@ class TipDetector:
     def estimate(
         self,
         views: Sequence[View],
-        signals: Sequence[Signal],
+        signals: Sequence[Image],
         photons: Sequence[float],
         inserted_length: float,
         lines: Sequence[Line] = (),
@@ -199,11 +198,11 @@ class TipDetector:
     def look(
         self,
         views: Sequence[View],
-        signals: Sequence[Signal],
+        signals: Sequence[Image],
         photons: Sequence[float],
         lines: Sequence[Line] = (),
         displaced: Float[np.ndarray, "3 3"] | None = None,
-        contrast: Sequence[Signal] | None = None,
+        contrast: Sequence[Image] | None = None,
     ) -> Exposure:
         """Return the evidence of a wire in the images of one exposure.
 
@@ -259,7 +258,7 @@ class TipDetector:
         most = _MOST_OF_CATHETER if np.isfinite(ends[catheter]).any() else 0.0
         return told, log_odds - max(float(seen.way[catheter][-1].max()) - most, 0.0)
 
-    def lines(self, view: View, before: Signal, photons: float) -> Line:
+    def lines(self, view: View, before: Image, photons: float) -> Line:
         """Return the pixels near lines of an image without a wire around the vessel, as an exposure would show them.
 
         Of more `photons` an exposure shows fainter lines.
@@ -273,7 +272,7 @@ class TipDetector:
         near[box] = binary_dilation(large[label], iterations=_MOVED_PX)
         return near
 
-    def _read(self, view: View, signal: Signal, photons: float, dark: Signal) -> tuple[Signal, Signal]:
+    def _read(self, view: View, signal: Image, photons: float, dark: Image) -> tuple[Image, Image]:
         """Return an image without contrast, and how likely its pixels are on a wire, none far from the vessel."""
         evidence = np.zeros_like(signal)
         box = _box_around(view, self.grid.middle, len(signal))
@@ -282,16 +281,17 @@ class TipDetector:
         evidence[box] = own_share(dark[box], photons) * self._saturated(ridge_evidence(plain[box], photons, rough))
         return plain, evidence
 
-    def _saturated(self, log_ratio: Signal) -> Signal:
+    def _saturated(self, log_ratio: Image) -> Signal:
         """Return evidence that no single pixel can overrule all others with."""
         likelier = np.exp(np.clip(log_ratio, -30, 30))
         return np.log((likelier + _HIDDEN_SHARE) / (1 + _ALIKE_SHARE * likelier)).astype(np.float32)
 
-    def without_contrast(self, view: View, signal: Signal, box: tuple[slice, slice] | None = None) -> Signal:
+    def without_contrast(self, view: View, signal: Image, box: tuple[slice, slice] | None = None) -> Signal:
         """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
         box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
-        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=BLUR_PX)
+        points, sizes = self._filled
+        path_mm = Shadow(view, len(signal), points).of(sizes, width_mm=width_mm, blur_px=BLUR_PX)
         path, part = (uniform_filter(one[box], 2)[::2, ::2] for one in (path_mm, signal))
         filled = path > _FILLED_MM
         if 4 * filled.sum() < _FEWEST_PX:
@@ -310,7 +310,7 @@ def own_share(dark: Float[np.ndarray, "*n"], photons: float) -> Float[np.ndarray
     return np.isfinite(dark) * (1 + ridges) / (1 + _ALONG_MM * ridges)
 
 
-def _box_around(view: View, points: Float[np.ndarray, "n 3"], rows: int, around_mm: float = 0.0) -> tuple[slice, slice]:
+def _box_around(view: View, points: Places, rows: int, around_mm: float = 0.0) -> tuple[slice, slice]:
     """Return the rows and columns of an image that show points, LPS mm, and what lies around them in space or image."""
     around = _AROUND_PX + around_mm * float(np.linalg.norm(view.slope(points.mean(axis=0)), 2)) + 1
     at = view.pixel(points, rows)

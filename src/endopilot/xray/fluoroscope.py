@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,12 +20,12 @@ from endopilot.anatomy.tree import tangents
 from endopilot.errors import InputError
 from endopilot.lines import places_on
 from endopilot.settings import Finite, Positive, settings
-from endopilot.simulation.motion import Motion
+from endopilot.simulation.config import CoreMotion
+from endopilot.simulation.motion import Motion, place, relative
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy
-from endopilot.xray.carm import CArmGeometry, View, view_at
-from endopilot.xray.moving_patient import seen_wire
+from endopilot.xray.carm import CArmGeometry, Places, Vector, View, view_at
 
 _CATHETER_MM = 20.0
 """Length of the guiding catheter behind the ostium that is straight, in which a tip may be found, mm."""
@@ -56,7 +55,7 @@ class TipMeasurement:
         around_sd_mm: that of the position around the vessel's line, across both, mm; likewise.
     """
 
-    position: Float[np.ndarray, "3"]
+    position: Vector
     abscissa: float
     offset: float
     branch: int
@@ -75,17 +74,23 @@ class TipMeasurement:
         return np.stack([self.abscissa - tip[..., 0], np.clip(tip[..., 1], low, high) - tip[..., 1]], axis=-1)
 
 
-@runtime_checkable
-class CArm(Protocol):
-    """A C-arm around one patient.
+class CArm:
+    """A C-arm around one patient, whose vessel is known from the CT and registered to it.
 
     Attributes:
         known_motion: what is known of how the patient moves; an exposure takes it off.
         registration_mm: the wire shows displaced by this, LPS mm.
     """
 
-    known_motion: Motion | None
-    registration_mm: tuple[float, float, float]
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        known_motion: Motion | None = None,
+        registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Take the patient."""
+        self._anatomy, self.known_motion, self.registration_mm = anatomy, known_motion, registration_mm
+        self._project = TipProjector(anatomy.tree, anatomy.insertion)
 
     def expose(
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
@@ -98,15 +103,56 @@ class CArm(Protocol):
             random: where the errors are drawn from.
             time_s: of this moment, s.
         """
-        ...
+        nodes, tip, heading = simulator.position[0], simulator.tip_position[0, 0], simulator.tip_direction[0, 0]
+        if any(self.registration_mm):
+            nodes, tip = nodes + self.registration_mm, tip + self.registration_mm
+        if simulator.set_up.motion is not None:
+            known = self.known_motion and self.known_motion.core(self._anatomy.insertion.position)
+            (maps,) = seen(simulator.vessel_to_laboratory[:1], known, np.array([time_s]))
+            nodes, tip, heading = place(maps, nodes), place(maps, tip), turned(maps, heading)
+        return self._show(nodes, tip, heading, inserted_length, random)
+
+    def _show(
+        self, nodes: Places, tip: Vector, heading: Vector, inserted_length: float, random: np.random.Generator
+    ) -> TipMeasurement | None:
+        """Return what an exposure shows of a wire: nodes from the foremost tip on, its tip, and the heading there."""
+        raise NotImplementedError
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
 
         Raises:
-            InputError: this C-arm's exposures cannot show it.
+            InputError: exposures cannot show it: what is assumed of errors says nothing of contrast.
         """
-        ...
+        raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
+
+
+def seen(
+    placed: Float[np.ndarray, "n 3 4"], known: CoreMotion | None, times_s: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3 4"]:
+    """Return the affine maps by which the C-arm sees points of the moving vessel displaced, mm in the vessel of the CT.
+
+    The vessel is truly placed so at these times, s; the C-arm takes the known motion off.
+    """
+    return placed if known is None else relative(placed, known.placements(times_s)[0])
+
+
+def seen_in_episodes(
+    motion: Motion | None, known: Motion | None, ostium: Vector, samples: int, period_s: float
+) -> Float[np.ndarray, "samples 3 4"] | None:
+    """Return `seen` at each sample of a dataset's navigations in one patient; None if the patient lies still."""
+    if motion is None:
+        return None
+    times_s = period_s * np.arange(1, samples + 1)
+    return seen(motion.core(ostium).placements(times_s)[0], known and known.core(ostium), times_s)
+
+
+def turned(
+    maps: Float[np.ndarray, "*maps 3 4"], directions: Float[np.ndarray, "*directions 3"]
+) -> Float[np.ndarray, "*turned 3"]:
+    """Return the unit vectors along lines, of such directions, after affine maps; both are broadcast."""
+    along = (maps[..., :3] @ directions[..., None])[..., 0]
+    return along / np.linalg.norm(along, axis=-1, keepdims=True)
 
 
 @settings
@@ -128,7 +174,7 @@ class FluoroscopeConfig:
 def measurement_at(
     project: TipProjector,
     anatomy: Anatomy,
-    places: Float[np.ndarray, "n 3"],
+    places: Places,
     covariances: Float[np.ndarray, "n 3 3"],
     weight: Float[np.ndarray, "n"] | None = None,
 ) -> TipMeasurement:
@@ -157,8 +203,8 @@ def measurement_at(
     )
 
 
-class Fluoroscope:
-    """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
+class Fluoroscope(CArm):
+    """A C-arm of assumed errors of detection."""
 
     def __init__(
         self,
@@ -170,33 +216,17 @@ class Fluoroscope:
         registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Bring the middle of the vessel to the isocenter; `wire_radius_mm` is the tip's, the rest as `CArm` says."""
-        self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
-        self.known_motion, self.registration_mm = known_motion, registration_mm
+        super().__init__(anatomy, known_motion, registration_mm)
+        self._config = config or FluoroscopeConfig()
         self._finder = TipFinder([(anatomy, wire_radius_mm)], self._config)
-        self._project = TipProjector(anatomy.tree, anatomy.insertion)
 
-    def expose(
-        self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
+    def _show(
+        self, nodes: Places, tip: Vector, heading: Vector, inserted_length: float, random: np.random.Generator
     ) -> TipMeasurement:
-        """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
-        ostium = self._anatomy.insertion.position
-        _, tip, heading = seen_wire(simulator, self.known_motion, ostium, time_s, self.registration_mm)
         return self.measure(tip, heading, inserted_length, random)
 
-    def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
-        """Refuse to: what is assumed of errors says nothing of contrast.
-
-        Raises:
-            InputError: always.
-        """
-        raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
-
     def measure(
-        self,
-        tip_position: Float[np.ndarray, "3"],
-        tip_direction: Float[np.ndarray, "3"],
-        inserted_length: float,
-        random: np.random.Generator,
+        self, tip_position: Vector, tip_direction: Vector, inserted_length: float, random: np.random.Generator
     ) -> TipMeasurement:
         """Take one exposure of every view and say where the tip is.
 
@@ -214,7 +244,7 @@ class Fluoroscope:
         weight = np.exp(0.5 * (cost[0] - cost)) * np.sqrt(np.linalg.det(covariances))
         return measurement_at(self._project, self._anatomy, places, covariances, weight)
 
-    def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
+    def catheter_axis(self, axis: Vector, random: np.random.Generator) -> Vector:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
 
         In a view the catheter is a line, and spans a plane with the source. The likeliest axis is returned, given these
@@ -273,8 +303,8 @@ class TipFinder:
     def find(
         self,
         arm: Int[np.ndarray, "n"],
-        tip: Float[np.ndarray, "n 3"],
-        heading: Float[np.ndarray, "n 3"],
+        tip: Places,
+        heading: Places,
         inserted: Float[np.ndarray, "n"],
         noise: Float[np.ndarray, "n views 2"],
     ) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m"], Float[np.ndarray, "m 3 3"]]:
@@ -310,7 +340,7 @@ class TipFinder:
         return row[order], place[order], found[order], information[order]
 
     def _seen(
-        self, arm: Int[np.ndarray, "n"], point: Float[np.ndarray, "n 3"]
+        self, arm: Int[np.ndarray, "n"], point: Places
     ) -> tuple[Float[np.ndarray, "n views 2"], Float[np.ndarray, "n views 2 3"]]:
         """Return the pixels of points, and their derivatives by the points, as `View.project` and `View.slope` do."""
         axes, scale = self._axes[arm], self._scale[arm]
@@ -326,7 +356,7 @@ class TipFinder:
         nearest: Int[np.ndarray, "n"],
         pixel: Float[np.ndarray, "n views 2"],
         whiten: Float[np.ndarray, "n views 2 2"],
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3 3"]]:
+    ) -> tuple[Places, Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3 3"]]:
         """Return the likeliest places near vertices, twice their negative log-likelihoods, the vertices nearest to them
         and the inverses of their covariances.
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.devices.device import Wire
@@ -37,8 +37,8 @@ from endopilot.xray.absorbers import (
     wire_points,
     without_contrast,
 )
-from endopilot.xray.carm import CArmGeometry, Pose, View, view_at, view_of
-from endopilot.xray.projector import blurred, cast, splat
+from endopilot.xray.carm import CArmGeometry, Image, Places, Pose, Vector, View, view_at, view_of
+from endopilot.xray.projector import Shadow, blurred, cast
 
 PHOTONS_MM2_UGY = 30174.0
 """Photons a mm² and µGy of a fluoroscopy beam (RQA 5 of IEC 62220-1)."""
@@ -116,9 +116,9 @@ class Plane:
 
     view: View
     zoom: float
-    background: Float32[np.ndarray, "rows columns"]
-    scatter: Float32[np.ndarray, "rows columns"]
-    vessel_mm: Float32[np.ndarray, "rows columns"]
+    background: Image
+    scatter: Image
+    vessel_mm: Image
     reference: float
     placed: Float[np.ndarray, "3 4"]
 
@@ -165,7 +165,12 @@ class XrayImager:
         self.lumen_points, self.lumen_sizes = lumen_points(anatomy)
         self.ct = None if ct is None else without_contrast(ct, self.lumen_points)
         self._guide = catheter_line(anatomy)
-        self._guide_wall, self._guide_lumen = catheter_points(anatomy), catheter_lumen_points(anatomy)
+        wall, wall_sizes = catheter_points(anatomy)
+        self._clouds = {
+            "guide": (wall, wall_sizes * CATHETER_MM, 0.0),
+            "lumen": (self.lumen_points, self.lumen_sizes, anatomy.distance_map.spacing_mm / 2),
+            "guide lumen": (*catheter_lumen_points(anatomy), 0.1),
+        }
 
     def plane(
         self,
@@ -192,32 +197,17 @@ class XrayImager:
             view = view_of(view, pose, self.isocenter)
         return self.plane_through(self.patient(view, rays=rays), view, zoom_factor, placed)
 
-    def plane_through(
-        self,
-        patient: Float32[np.ndarray, "rows columns"],
-        view: View,
-        zoom_factor: float,
-        placed: Float[np.ndarray, "3 4"],
-    ) -> Plane:
-        """Compute what does not move, but for the patient, which is given.
-
-        Args:
-            patient: from `patient`.
-            view: source and detector, in the CT's frame.
-            zoom_factor: magnification of the image.
-            placed: affine map of vessel and catheter, as `plane` takes it.
-        """
-        background = patient + self.guide(view, zoom_factor, placed)
-        width, blur = self.anatomy.distance_map.spacing_mm / 2, self.blur_px(zoom_factor)
-        points, sizes = self.lumen_points, self.lumen_sizes
-        vessel = splat(view, self.config.pixels, points, sizes, placed=placed, width_mm=width, blur_px=blur)
-        vessel += self.guide_lumen(view, zoom_factor, placed)
+    def plane_through(self, patient: Image, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]) -> Plane:
+        """Compute what does not move, as `plane` does, given the attenuation of the patient in a view of the CT."""
+        background = patient + self.cloud("guide", view, zoom_factor, placed)
+        vessel = self.cloud("lumen", view, zoom_factor, placed)
+        vessel += self.cloud("guide lumen", view, zoom_factor, placed)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
         usual = float(np.log(np.median(primary + scatter)))
         return Plane(view, zoom_factor, background, scatter, vessel, usual, placed)
 
-    def patient(self, view: View, *, rays: int = 256) -> Float32[np.ndarray, "rows columns"]:
+    def patient(self, view: View, *, rays: int = 256) -> Image:
         """Return the attenuation along each ray without vessel, catheters and wire, `rays` a side interpolated."""
         pixels = self.config.pixels
         if self.ct is None:
@@ -226,36 +216,33 @@ class XrayImager:
         wide = zoom(through, pixels / through.shape[0], order=1, grid_mode=True, mode="nearest")
         return np.asarray(wide, dtype=np.float32)
 
-    def guide(
-        self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the attenuation of the guiding catheter's wall along each ray; arguments as `plane_through` has."""
-        points, size = self._guide_wall
-        blur = self.blur_px(zoom_factor)
-        return splat(view, self.config.pixels, points, size * CATHETER_MM, placed=placed, blur_px=blur)
-
-    def guide_lumen(
-        self, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the path of each ray inside the guiding catheter, mm; arguments as `plane_through` has."""
-        points, size = self._guide_lumen
-        blur = self.blur_px(zoom_factor)
-        return splat(view, self.config.pixels, points, size, placed=placed, width_mm=0.1, blur_px=blur)
+    def cloud(
+        self,
+        part: Literal["guide", "lumen", "guide lumen"],
+        view: View,
+        zoom_factor: float,
+        placed: Float[np.ndarray, "3 4"],
+    ) -> Image:
+        """Return the attenuation of the guiding catheter's wall along each ray, or the ray's path through the vessel's
+        lumen or inside the guiding catheter, mm; other arguments as `plane_through` has."""
+        points, sizes, width_mm = self._clouds[part]
+        shadow = Shadow(view, self.config.pixels, points, placed)
+        return shadow.of(sizes, width_mm=width_mm, blur_px=self.blur_px(zoom_factor))
 
     def signal(
         self,
         plane: Plane,
-        nodes: Float[np.ndarray, "n 3"],
+        nodes: Places,
         *,
         contrast: float = 0.0,
         dose: float = 1.0,
         seed: int = 0,
-        noise: Float32[np.ndarray, "rows columns"] | None = None,
-        before: Float32[np.ndarray, "rows columns"] | None = None,
-        velocity: Float[np.ndarray, "n 3"] | None = None,
+        noise: Image | None = None,
+        before: Image | None = None,
+        velocity: Places | None = None,
         catheters: Sequence[Float[np.ndarray, "_ 3"]] = (),
         catheter_velocities: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
-    ) -> Float32[np.ndarray, "rows columns"]:
+    ) -> Image:
         """Return what the C-arm makes of what its detector reads: the logarithm of the light over the usual one.
 
         The same seed gives the same noise.
@@ -300,11 +287,7 @@ class XrayImager:
         return np.float32(1 - config.temporal_weight) * read + np.float32(config.temporal_weight) * before
 
     def grey(
-        self,
-        signal: Float32[np.ndarray, "rows columns"],
-        *,
-        mask: Float32[np.ndarray, "rows columns"] | None = None,
-        roadmap: Float32[np.ndarray, "rows columns"] | None = None,
+        self, signal: Image, *, mask: Image | None = None, roadmap: Image | None = None
     ) -> UInt8[np.ndarray, "rows columns"]:
         """Return a signal as grey values from 0 (black) to 255.
 
@@ -316,9 +299,7 @@ class XrayImager:
             value = value + _ROADMAP_GREY * (1 - np.exp(-np.float32(self.config.iodine_mm) * roadmap))
         return np.clip(value, 0, 255).astype(np.uint8)
 
-    def wire(
-        self, plane: Plane, *lines: Float[np.ndarray, "_ 3"], number: int = 0
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def wire(self, plane: Plane, *lines: Float[np.ndarray, "_ 3"], number: int = 0) -> Image:
         """Return the attenuation of the wire, or of a catheter around it, along each ray, mean over some places of it.
 
         At each its nodes begin at the tip, LPS mm. The wire's number is 0, then come the catheters from the inside out.
@@ -334,8 +315,8 @@ class XrayImager:
             width_mm = (catheter.tip_radius_mm - catheter.inner_diameter_mm / 2) / np.sqrt(12)
         drawn = [draw(in_catheter(self.anatomy, nodes, self._guide)) for nodes in lines]
         points, sizes = (np.concatenate(each) for each in zip(*drawn, strict=True))
-        how = {"placed": plane.placed, "width_mm": width_mm, "blur_px": self.blur_px(plane.zoom)}
-        return splat(plane.view, config.pixels, points, sizes / len(lines), **how)
+        shadow = Shadow(plane.view, config.pixels, points, plane.placed)
+        return shadow.of(sizes / len(lines), width_mm=width_mm, blur_px=self.blur_px(plane.zoom))
 
     def air_kerma_ugy(self, plane: Plane, dose: float) -> float:
         """Return the air kerma of a frame at the patient's entrance reference point, µGy."""
@@ -349,9 +330,7 @@ class XrayImager:
         config, side = self.config, self.config.geometry.pixel_mm / plane.zoom
         return PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * side**2
 
-    def _moving(
-        self, plane: Plane, number: int, nodes: Float[np.ndarray, "n 3"], velocity: Float[np.ndarray, "n 3"] | None
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def _moving(self, plane: Plane, number: int, nodes: Places, velocity: Places | None) -> Image:
         """Return the mean attenuation of a device over the pulse, which ends with the device at its nodes."""
         if velocity is None:
             return self.wire(plane, nodes, number=number)
@@ -365,9 +344,7 @@ class XrayImager:
         config = self.config
         return float(np.hypot(config.penumbra_mm, config.scintillator_mm) / config.geometry.pixel_mm * zoom_factor)
 
-    def _scattered(
-        self, primary: Float32[np.ndarray, "rows columns"], zoom_factor: float
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def _scattered(self, primary: Image, zoom_factor: float) -> Image:
         """Return the scattered light: a share of the other, spread out; the beam is as wide as the image."""
         config, squares = self.config, max(len(primary) // _COARSE, 1)
         small = zoom(primary, squares / len(primary), order=1, grid_mode=True, mode="nearest")
@@ -376,6 +353,6 @@ class XrayImager:
         return np.asarray(zoom(spread, len(primary) / squares, order=1, grid_mode=True, mode="nearest"), np.float32)
 
 
-def isocenter_of(anatomy: Anatomy) -> Float[np.ndarray, "3"]:
+def isocenter_of(anatomy: Anatomy) -> Vector:
     """Return the middle of a vessel, about which the C-arm turns, LPS mm."""
     return anatomy.tree.line.points.mean(axis=0)

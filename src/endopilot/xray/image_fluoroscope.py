@@ -10,20 +10,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32
 
-from endopilot.anatomy.projection import TipProjector
 from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, published_mean
-from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
-from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.carm import Image, Places, Pose, Vector, view_at
 from endopilot.xray.detector import DISPLACED_MM, TipDetector
-from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement, measurement_at
+from endopilot.xray.fluoroscope import CArm, FluoroscopeConfig, TipMeasurement, measurement_at
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
-from endopilot.xray.moving_patient import seen_wire
 from endopilot.xray.registration import Registration, register, register_motion, take_run
 
 _NO_WIRE = np.zeros((0, 3))
@@ -35,8 +31,8 @@ class NotRegistered(InputError):
     """A vessel is not recognised in the X-ray images that were to register the patient."""
 
 
-class ImageFluoroscope:
-    """A C-arm around one patient, whose vessel is known from the CT and whose pose is not.
+class ImageFluoroscope(CArm):
+    """A C-arm around one patient whose pose is not known beforehand.
 
     Attributes:
         pose: in which the patient truly lies; nothing that is measured knows it.
@@ -63,26 +59,21 @@ class ImageFluoroscope:
         Raises:
             NotRegistered: the vessel is not recognised in the images.
         """
-        config = config or FluoroscopeConfig()
-        random = np.random.default_rng([seed, 0x706F7365])
-        angles = config.view_angles_deg[: 2 if config.biplane else 1]
-        self.pose, self._anatomy, self.known_motion = Pose.draw(random), anatomy, known_motion
-        self.registration_mm = registration_mm
-        self._imager = XrayImager(
-            anatomy, device, ct=surroundings(anatomy), config=ImageConfig(geometry=config.geometry)
-        )
-        self._angles_deg = angles
-        self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
-        self._views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]
+        super().__init__(anatomy, known_motion, registration_mm)
+        config, random = config or FluoroscopeConfig(), np.random.default_rng([seed, 0x706F7365])
+        self.pose, self._angles_deg = Pose.draw(random), config.view_angles_deg[: 1 + config.biplane]
+        image = ImageConfig(geometry=config.geometry)
+        self._imager = imager = XrayImager(anatomy, device, ct=surroundings(anatomy), config=image)
+        self._planes = [imager.plane(angles, pose=self.pose) for angles in self._angles_deg]
+        views = [view_at(angles, imager.isocenter, config.geometry) for angles in self._angles_deg]
         lit, before = ([self._signal(plane, _NO_WIRE, random, share) for plane in self._planes] for share in (1.0, 0.0))
         self._before = before
-        self.registration: Registration = register(anatomy, self._views, lit, before, self._imager.config)
+        self.registration: Registration = register(anatomy, views, lit, before, image)
         if self.registration.failure:
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
         self._detector = TipDetector(anatomy, device)
-        self._project = TipProjector(anatomy.tree, anatomy.insertion)
-        self._registered = self.registration.views(self._views, self._imager.isocenter)
-        self._photons = [self._imager.photons(plane) for plane in self._planes]
+        self._registered = self.registration.views(views, imager.isocenter)
+        self._photons = [imager.photons(plane) for plane in self._planes]
         self._lines = list(map(self._detector.lines, self._registered, before, self._photons))
         self.forget_wires()
 
@@ -106,20 +97,12 @@ class ImageFluoroscope:
             raise NotRegistered(f"X-ray images: the motion of {name} cannot be measured: {found.failure}")
         return found.motion
 
-    def expose(
-        self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
+    def _show(
+        self, nodes: Places, tip: Vector, heading: Vector, inserted_length: float, random: np.random.Generator
     ) -> TipMeasurement | None:
-        """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
-        ostium = self._anatomy.insertion.position
-        nodes, _, _ = seen_wire(simulator, self.known_motion, ostium, time_s, self.registration_mm)
         return self.measure(nodes, inserted_length, random)
 
-    def measure(
-        self,
-        nodes: Float[np.ndarray, "n 3"],
-        inserted_length: float,
-        random: np.random.Generator,
-    ) -> TipMeasurement | None:
+    def measure(self, nodes: Places, inserted_length: float, random: np.random.Generator) -> TipMeasurement | None:
         """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be.
 
         None where no wire is found. One whose tip is not ambiguous refines the pose that later exposures take the
@@ -134,7 +117,5 @@ class ImageFluoroscope:
             self.shift, self.spread = self.shift + found.shift, found.spread[3:, 3:] + DRIFTS_MM**2 * np.eye(3)
         return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
 
-    def _signal(
-        self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def _signal(self, plane: Plane, nodes: Places, random: np.random.Generator, contrast: float = 0.0) -> Image:
         return self._imager.signal(plane, nodes, contrast=contrast, seed=int(random.integers(2**31)))

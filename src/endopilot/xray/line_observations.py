@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.tree import smoothed
 from endopilot.lines import length_along, places_on
 from endopilot.xray.camera import Camera
-from endopilot.xray.carm import View
+from endopilot.xray.carm import Places, Vector, View
 from endopilot.xray.vessel_grid import VesselGrid
 
 Line = Float[np.ndarray, "_ 2"]
@@ -84,9 +84,7 @@ class Observations(NamedTuple):
     """Whether it was made."""
 
 
-def shown_by(
-    camera: Camera | View, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+def shown_by(camera: Camera | View, points: Places) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
     """Return the pixels of points, and the derivative by the point, pixels/mm."""
     slope = [(camera.project(points + axis) - camera.project(points - axis)) / 2 for axis in np.eye(3)]
     return camera.project(points), np.stack(slope, axis=-1)
@@ -114,7 +112,7 @@ def smooth_line(line: Line, width: float) -> tuple[Line, float, float]:
     return blurred, rough, rough / float(np.sqrt(averaged))
 
 
-def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Float[np.ndarray, "n 3"]) -> SeenLine:
+def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Places) -> SeenLine:
     """Return a line's points, evenly apart, and the grid as the camera shows it where the pose has it."""
     shown, slope = shown_by(camera, way)
     scale = np.sqrt((slope**2).sum(axis=(1, 2)) / 2)
@@ -198,9 +196,7 @@ def joined(parts: Sequence[Observations]) -> Observations:
     return Observations(*(np.concatenate(one, axis=min(1, one[0].ndim - 1)) for one in columns))
 
 
-def shift_onto(
-    camera: Camera | View, point: Float[np.ndarray, "3"], pixel: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "3"]:
+def shift_onto(camera: Camera | View, point: Vector, pixel: Float[np.ndarray, "2"]) -> Vector:
     """Return the shift across the beam that takes a point, LPS mm, to the pixel that shows it."""
     shift = np.zeros(3)
     for _ in range(4):

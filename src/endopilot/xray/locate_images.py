@@ -21,9 +21,9 @@ from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy
-from endopilot.xray.carm import Pose, View, view_of
+from endopilot.xray.carm import Image, Places, Pose, View, view_of
 from endopilot.xray.cine import XrayCine
-from endopilot.xray.detector import Exposure, Signal, TipDetector, own_share
+from endopilot.xray.detector import Exposure, TipDetector, own_share
 from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
@@ -76,7 +76,7 @@ class ImagesLocated:
     best: int
     notes: tuple[str, ...]
 
-    def pixels(self, frame: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    def pixels(self, frame: int, points: Places) -> Float[np.ndarray, "n 2"]:
         """Return column and row, pixels of the first plane, of points of the vessel or in it, LPS mm of the CT."""
         return self.views[frame][0].pixel(points, self.cines[0].signals.shape[1])[:, ::-1]
 
@@ -205,8 +205,8 @@ def _empty(cine: XrayCine) -> Signal:
 
 
 def _darkened(
-    shown: Float32[np.ndarray, "frames rows rows"], empty: Signal, field: Bool[np.ndarray, "rows rows"]
-) -> list[Signal]:
+    shown: Float32[np.ndarray, "frames rows rows"], empty: Image, field: Bool[np.ndarray, "rows rows"]
+) -> list[Image]:
     """Return how much darker than without contrast the surroundings of each pixel are: a wire darkens them little.
 
     Where nothing is seen anything may be, contrast without bound.
@@ -215,7 +215,7 @@ def _darkened(
     return [np.where(field, np.maximum(one - np.median(one[field]), 0), np.float32(np.inf)) for one in dark]
 
 
-def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Signal], photons: Sequence[float]) -> bool:
+def _is_clear(grid: VesselGrid, views: Sequence[View], dark: Sequence[Image], photons: Sequence[float]) -> bool:
     """Return whether nearly no part of the vessel has contrast whose ridges are as large as the noise."""
     own = []
     for view, each, count in zip(views, dark, photons, strict=True):

@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32
 from endopilot.files import write_whole
 from endopilot.plotting import BLUE, GREY, ORANGE, STYLE, VERMILLION, png
 from endopilot.types import Anatomy
+from endopilot.xray.carm import Places
 from endopilot.xray.tip_filter import TipLocation
 
 _SHOWN = 4
@@ -26,7 +27,7 @@ def draw_locations(
     output: str | Path,
     *,
     lines: Sequence[Float[np.ndarray, "_ 2"] | None],
-    project: Callable[[int, Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 2"]],
+    project: Callable[[int, Places], Float[np.ndarray, "n 2"]],
     images: Float32[np.ndarray, "frames rows columns"] | None = None,
 ) -> None:
     """Draw some frames of the first camera as PNG: the device's line, pixels, and the vessel where it lies.

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM
-from endopilot.xray.carm import View
+from endopilot.xray.carm import Image, Places, View
 
 _RAY_STEP_MM = 1.5
 _COARSE_MM, _COARSE_RAYS, _SIDES_MM = 8.0, 64, 15.0
@@ -100,41 +100,12 @@ def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray,
     return along(2, low[0] + nx * (low[1] + ny * low[2]))
 
 
-def splat(
-    view: View,
-    pixels: int,
-    points: Float[np.ndarray, "n 3"],
-    volume: Float[np.ndarray, "n"] | float,
-    *,
-    placed: Float[np.ndarray, "3 4"] | None = None,
-    width_mm: float = 0.0,
-    blur_px: float = 0.0,
-) -> Float32[np.ndarray, "pixels pixels"]:
-    """Return line integrals of small volumes: each is shared among four pixels, then blurred.
-
-    Args:
-        view: source and detector.
-        pixels: of the image along a side.
-        points: places, LPS mm.
-        volume: mm³, or mm² where it is weighted by an attenuation.
-        placed: affine map that moves the points first, LPS mm.
-        width_mm: standard deviation of each in space, mm.
-        blur_px: standard deviation of the detector's blur, pixels.
-    """
-    return Shadow(view, pixels, points, placed).of(volume, width_mm=width_mm, blur_px=blur_px)
-
-
 class Shadow:
-    """Where small volumes fall on the detector, for the line integrals of several quantities of them."""
+    """Where small volumes fall on the detector, and line integrals of several quantities of them."""
 
-    def __init__(
-        self,
-        view: View,
-        pixels: int,
-        points: Float[np.ndarray, "n 3"],
-        placed: Float[np.ndarray, "3 4"] | None = None,
-    ) -> None:
-        """Project the volumes; arguments as `splat` has."""
+    def __init__(self, view: View, pixels: int, points: Places, placed: Float[np.ndarray, "3 4"] | None = None) -> None:
+        """Project volumes at some points, LPS mm, after an affine map, if one is given, onto an image of so many pixels
+        along a side."""
         onto = np.eye(3, 4) if placed is None else placed.copy()
         onto[:, 3] -= view.source
         self._pixels, self._count = pixels, len(points)
@@ -157,7 +128,8 @@ class Shadow:
     def of(
         self, volume: Float[np.ndarray, "n"] | float, *, width_mm: float = 0.0, blur_px: float = 0.0
     ) -> Float32[np.ndarray, "pixels pixels"]:
-        """Return line integrals of the volumes; arguments as `splat` has."""
+        """Return line integrals of volumes, mm³, or mm² where they are weighted by an attenuation: each is shared among
+        four pixels, then blurred by its width in space and by the detector, standard deviations, mm and pixels."""
         image = np.zeros((self._pixels, self._pixels), dtype=np.float32)
         if not len(self._first):
             return image
@@ -181,10 +153,8 @@ class Shadow:
 
 
 def blurred(
-    image: Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"],
-    sigma_px: float,
-    mode: Literal["constant", "reflect"] = "reflect",
-) -> Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]:
+    image: Float[np.ndarray, "rows columns"] | Image, sigma_px: float, mode: Literal["constant", "reflect"] = "reflect"
+) -> Float[np.ndarray, "rows columns"] | Image:
     """Return an image, blurred by a standard deviation in pixels, which may be too small to change it."""
     if sigma_px < _SHARP_PX:
         return image

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.spatial import KDTree
@@ -22,7 +22,7 @@ from skimage.transform import downscale_local_mean
 from endopilot.simulation.motion import AMPLITUDES, Motion
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
-from endopilot.xray.carm import Pose, View, view_of
+from endopilot.xray.carm import Image, Places, Pose, Vector, View, view_of
 from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
 from endopilot.xray.projector import Shadow
 
@@ -53,7 +53,7 @@ _LITTLE = 0.01
 _MISFIT = 0.1
 """Residuals are scaled by this share of the full contrast; beyond it they count less."""
 
-Images = Sequence[Float32[np.ndarray, "rows columns"]]
+Images = Sequence[Image]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Registration:
     failure: str
     motion: Motion | None = None
 
-    def views(self, views: Sequence[View], isocenter: Float[np.ndarray, "3"]) -> list[View]:
+    def views(self, views: Sequence[View], isocenter: Vector) -> list[View]:
         """Return views that were given in the C-arm's frame in the CT's frame."""
         return [view_of(view, self.pose, isocenter) for view in views]
 
@@ -95,16 +95,11 @@ def register(
     config: ImageConfig | None = None,
     start: Pose | None = None,
 ) -> Registration:
-    """Find the pose in which the patient lies.
+    """Find the pose in which the patient lies, given an image of the filled vessel, and one before, for each view.
 
-    Args:
-        anatomy: the vessel of the CT.
-        views: of the images, in the C-arm's frame.
-        contrasted: an image of the filled vessel for each view, from `XrayImager.signal`.
-        before: the image before the injection, likewise.
-        config: detector and beam.
-        start: the pose that is looked around, such as that of the frame before, in a cine, whose contrast need not fill
-            the vessel alike; the pose that the CT has, and a vessel that is filled, if not given.
+    Views are in the C-arm's frame, images those of `XrayImager.signal`. A start is the pose that is looked around, such
+    as that of the frame before, in a cine, whose contrast need not fill the vessel alike; without one it is the pose
+    that the CT has, and the vessel is filled.
     """
     isocenter, lumen = isocenter_of(anatomy), sampled_lumen(anatomy, alike=start is None)
     laid = np.zeros(6) if start is None else start.vector
@@ -132,13 +127,9 @@ def register_motion(
 ) -> Registration:
     """Find the amplitudes of a patient's motion; phase and period of heart and breath are known, by ECG and belt.
 
-    Args:
-        anatomy: the vessel of the CT.
-        views: of the images, in the frame of the CT as the patient was registered.
-        contrasted: an image of the filled vessel for each of `RUN_TIMES_S` and view, from `XrayImager.signal`.
-        before: an image for each view before the injection, with heart and breath at rest.
-        mean: what is known beforehand: the published mean of what moves, with the patient's periods.
-        config: detector and beam.
+    Views are in the frame of the CT as the patient was registered. The vessel is filled in an image for each of
+    `RUN_TIMES_S` and view; in those before, heart and breath are at rest. `mean` is what is known beforehand: the
+    published mean of what moves, with the patient's periods.
     """
     names = [name for name in AMPLITUDES if getattr(mean, name) != 0]
     centre = np.array([getattr(mean, name) for name in names])
@@ -167,11 +158,8 @@ def take_run(
     pose: Pose,
     motion: Motion,
     random: np.random.Generator,
-) -> list[list[Float32[np.ndarray, "rows columns"]]]:
-    """Inject contrast into a patient who lies and moves so; return an image for each of `RUN_TIMES_S` and view.
-
-    Angles are LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
-    """
+) -> list[list[Image]]:
+    """Inject contrast into a patient who lies and moves so; return an image for each of `RUN_TIMES_S` and view."""
     run, none = [], np.zeros((0, 3))
     for placed in motion.core(np.asarray(imager.anatomy.insertion.position)).placements(np.array(RUN_TIMES_S))[0]:
         planes = [imager.plane(angle, pose=pose, placed=placed) for angle in angles_deg]
@@ -214,7 +202,7 @@ class _Sought(NamedTuple):
     bounds: tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]
 
 
-_Lumen = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
+_Lumen = tuple[Places, Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
 
 
 def _fit(
@@ -237,17 +225,9 @@ def _fit(
         fewer = points, size * (lumen[1].sum() / size.sum()), along
         level = _Comparison(sought, fewer, views, observed, averaged, blur, config)
         slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
-        found = least_squares(
-            level.residuals,
-            found,
-            slope,
-            bounds=sought.bounds,
-            x_scale=sought.sd,
-            max_nfev=10,
-            xtol=1e-4,
-            ftol=1e-4,
-        ).x
-        correlation, covariance = level.correlation(found), level.covariance(found)
+        how = {"bounds": sought.bounds, "x_scale": sought.sd, "max_nfev": 10, "xtol": 1e-4, "ftol": 1e-4}
+        fit = least_squares(level.residuals, found, slope, **how)
+        found, correlation, covariance = fit.x, level.correlation(fit.x), level.covariance(fit.jac, fit.fun)
     disagrees = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
     return found, covariance, correlation, "" if correlation >= _AGREES else disagrees
 
@@ -317,9 +297,9 @@ class _Comparison:
         columns = [(self.residuals(sought + step) - self.residuals(sought - step)) / (2 * step.sum()) for step in steps]
         return np.stack(columns, axis=-1)
 
-    def covariance(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+    def covariance(self, slope: Float[np.ndarray, "n k"], residual: Float[np.ndarray, "n"]) -> Float[np.ndarray, "k k"]:
         """Return the covariance of what fits: what the pixels leave open, with the prior."""
-        slope, residual = self.slope(sought)[: -len(sought)], self.residuals(sought)[: -len(sought)]
+        slope, residual = (part[: -slope.shape[1]] for part in (slope, residual))
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
         misfit = float(np.sqrt(np.mean(residual[near] ** 2))) * self._together
         return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
@@ -356,35 +336,20 @@ def observed_contrast(
 
 def sampled_lumen(
     anatomy: Anatomy, *, alike: bool = True
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too.
-
-    Args:
-        anatomy: the vessel.
-        alike: whether contrast fills all of it alike, as when an injection waits for that.
-
-    Returns:
-        Places, LPS mm, the volume that each stands for, mm³, and how far along the vessel it lies, from 0 to 1; 0 if
-        it is filled alike.
-    """
-    points, size = lumen_points(anatomy)
+) -> tuple[Places, Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too: places, LPS mm, the
+    volume that each stands for, mm³, and how far along the vessel it lies, from 0 to 1; 0 if contrast fills all of it
+    alike, as when an injection waits for that."""
     behind, size_behind = catheter_lumen_points(anatomy)
     reach_mm, count = (10.0, _POINTS // 10) if alike else (30.0, _POINTS // 20)
     near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < reach_mm
-    random = np.random.default_rng(0)
-    chosen = random.permutation(len(points))[:_POINTS]
-    inside = np.flatnonzero(near)
-    inside = inside[random.permutation(len(inside))[:count]]
+    random, parts = np.random.default_rng(0), []
+    for points, size, most in ((*lumen_points(anatomy), _POINTS), (behind[near], size_behind[near], count)):
+        chosen = random.permutation(len(points))[:most]
+        parts.append((points[chosen], size[chosen] * size.sum() / size[chosen].sum()))
+    (inside, _), (others, _) = parts
     line = anatomy.tree.line
     share = 0.0 if alike else 1 / line.abscissa.max()
-    along = share * line.abscissa[KDTree(line.points).query(points[chosen])[1]]
-    return (
-        np.concatenate([points[chosen], behind[inside]]),
-        np.concatenate(
-            [
-                size[chosen] * size.sum() / size[chosen].sum(),
-                size_behind[inside] * size_behind[near].sum() / size_behind[inside].sum(),
-            ]
-        ),
-        np.concatenate([along, np.zeros(len(inside))]),
-    )
+    along = share * line.abscissa[KDTree(line.points).query(inside)[1]]
+    points, size = map(np.concatenate, zip(*parts, strict=True))
+    return points, size, np.append(along, np.zeros(len(others)))

@@ -23,7 +23,7 @@ from endopilot.progress import progress
 from endopilot.settings import public
 from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.camera import Camera
-from endopilot.xray.carm import Pose, View
+from endopilot.xray.carm import Places, Pose, Vector, View
 from endopilot.xray.line_observations import (
     DeviceFrame,
     Line,
@@ -86,13 +86,13 @@ class TipLocation:
 
     frame: int
     status: Status
-    position: Float[np.ndarray, "3"]
+    position: Vector
     covariance: Float[np.ndarray, "3 3"]
     share: float
     abscissa: float
     branch: int
     section: str
-    moved_mm: Float[np.ndarray, "3"]
+    moved_mm: Vector
     residual_mm: float
 
     @classmethod
@@ -250,7 +250,7 @@ class TipFilter:
         self._log, self._mean = np.log(total), mean
         self._covariance = square - mean[:, :, None] * mean[:, None] + frames * drift
 
-    def _moved(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 3"]:
+    def _moved(self, pose: Float[np.ndarray, "6"]) -> Places:
         return Pose(pose[3:], pose[:3]).move(self._way, self._centre)
 
     def _compare(

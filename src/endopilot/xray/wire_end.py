@@ -7,15 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from scipy.ndimage import map_coordinates, uniform_filter1d
 from scipy.optimize import leastsq
 from scipy.special import ndtr
 
-from endopilot.xray.carm import View
+from endopilot.xray.carm import Image, View
 from endopilot.xray.tip_posterior import TipEstimate
 
-Image = Float32[np.ndarray, "rows columns"]
 _END_PLACES = 4
 """Places of the wire's end that give its first direction, and how far aside of the centerline it runs there."""
 _LEAD_PX, _OF_PIXEL, _STRAIGHT_PX = 12, 0.3, 1.0
@@ -102,11 +101,7 @@ def fit_end(
 
 
 def refined(
-    found: TipEstimate,
-    views: Sequence[View],
-    signals: Sequence[Image],
-    evidence: Sequence[Image],
-    radius_mm: float,
+    found: TipEstimate, views: Sequence[View], signals: Sequence[Image], evidence: Sequence[Image], radius_mm: float
 ) -> TipEstimate:
     """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
 

@@ -20,12 +20,11 @@ from scipy.special import logsumexp
 
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import CATHETER_MM, catheter_points
-from endopilot.xray.carm import View
-from endopilot.xray.projector import splat
+from endopilot.xray.carm import Image, Vector, View
+from endopilot.xray.projector import Shadow
 from endopilot.xray.tip_posterior import Told
 from endopilot.xray.vessel_grid import VesselGrid
 
-Evidence = Float32[np.ndarray, "rows columns"]
 _SHORTER_SHARE, _LONGER_SHARE, _NEAR_MM = 0.1, 0.04, 2.0
 """The way to the tip differs from the inserted length by 2 mm, and a tenth of it where it is shorter, since wires snake
 and loop; it is hardly longer: wires only cut bends short."""
@@ -69,10 +68,7 @@ class Shifts:
 
 
 def possible_shifts(
-    views: Sequence[View],
-    ostium: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
-    share: float,
+    views: Sequence[View], ostium: Vector, covariance: Float[np.ndarray, "3 3"], share: float
 ) -> Shifts:
     """Return the shifts that are tried of a vessel that is displaced with this share and covariance, mm²."""
     rows = np.concatenate([view.slope(ostium) for view in views])
@@ -101,10 +97,10 @@ class Seat:
         self._points = np.concatenate([part, part - 2 * behind[:, None] * heading])
         self._size = np.tile(size[near], 2) * CATHETER_MM * np.repeat([1.0, -_AHEAD], len(part))
 
-    def __call__(self, view: View, image: Evidence, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
+    def __call__(self, view: View, image: Image, shifts_px: Float[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
         """Return how likely an image without contrast makes some shifts of the vessel, right and up, a logarithm."""
         reach = int(np.ceil(np.abs(shifts_px).max())) + 1
-        model = splat(view, len(image), self._points, self._size)
+        model = Shadow(view, len(image), self._points).of(self._size)
         rows, columns = np.nonzero(model)
         if len(rows) < 2:
             return np.zeros(len(shifts_px))
@@ -184,7 +180,7 @@ def way_to(
     grid: VesselGrid,
     room_mm: Float[np.ndarray, "n"],
     views: Sequence[View],
-    evidence: Sequence[Evidence],
+    evidence: Sequence[Image],
     shifts: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "n t"]:
     """Return the evidence of a wire on the way to each place, for each shift of the vessel."""
@@ -203,11 +199,7 @@ def way_to(
 
 
 def _read(
-    grid: VesselGrid,
-    room_mm: Float[np.ndarray, "n"],
-    view: View,
-    image: Evidence,
-    shifts_px: Float[np.ndarray, "t 2"],
+    grid: VesselGrid, room_mm: Float[np.ndarray, "n"], view: View, image: Image, shifts_px: Float[np.ndarray, "t 2"]
 ) -> Float32[np.ndarray, "n t"]:
     """Return the mean likelihood of a wire over the lumen at each place, a logarithm, for each shift of the image."""
     points, shown = grid.middle, view.project(grid.middle)
