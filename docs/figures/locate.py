@@ -22,8 +22,7 @@ from benchmarks.figures import fill
 from endopilot.anatomy.extract import extract_anatomy
 from endopilot.types import Anatomy
 from endopilot.xray.camera import Camera, read_camera
-from endopilot.xray.frames import DeviceFrame, read_frames
-from endopilot.xray.locate_picture import draw_locations
+from endopilot.xray.frames import DeviceFrame, draw_locations, read_frames
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
 TRAINED = 37

@@ -12,8 +12,7 @@ from scipy.special import ndtr
 from endopilot.xray.carm import CArmGeometry, view_at
 from endopilot.xray.detector import CATHETER_MM, TipDetector
 from endopilot.xray.image import XrayImager
-from endopilot.xray.tip_posterior import Told, estimated
-from endopilot.xray.vessel_grid import make_grid, with_catheter
+from endopilot.xray.tip_posterior import Told, VesselGrid
 from endopilot.xray.wire_end import fit_end
 from endopilot.xray.wire_likelihood import Shifts, end_log, possible_shifts, tell, way_to
 
@@ -126,11 +125,11 @@ def test_the_end_of_a_line_is_found_to_a_part_of_a_pixel():
 
 def ends_in(fork, view, image, length):
     """Return what one image of evidence says of a wire's end in a vessel that lies where it is registered."""
-    grid = with_catheter(make_grid(fork.tree, step_mm=0.5), fork, CATHETER_MM)
+    grid = VesselGrid.of(fork.tree, step_mm=0.5).with_catheter(fork, CATHETER_MM)
     still, room_mm = Shifts(np.zeros((1, 3)), np.zeros(1), np.zeros((3, 3))), grid.radius - 0.18 + 0.3
     ends = end_log(grid.abscissa, length)
     told, log_odds = tell(grid, room_mm, way_to(grid, room_mm, [view], [image], still.mm), still, ends)
-    return replace(estimated(grid, told, ends, 4.0), log_odds=log_odds)
+    return replace(grid.estimate(told, ends, 4.0), log_odds=log_odds)
 
 
 def test_evidence_and_encoder_both_count(fork, planes):
@@ -184,10 +183,10 @@ def test_a_straight_vessel_that_lies_off_along_itself_is_not_taken_for_sure(imag
 
 def test_a_posterior_of_two_places_is_at_the_likelier_one_and_its_region_holds_both(fork):
     """Σ of an ambiguous tip is that near its mode, and w·d·dᵀ of a place at d of weight w."""
-    grid = make_grid(fork.tree, step_mm=1.0)
+    grid = VesselGrid.of(fork.tree, step_mm=1.0)
     places = np.array([5, 40])
     told = Told(places, np.log([0.7, 0.3]), np.zeros((2, 6)), np.tile(np.diag([0.1] * 6), (2, 1, 1)))
-    found = replace(estimated(grid, told, np.zeros(2), 4.0), status="ambiguous")
+    found = replace(grid.estimate(told, np.zeros(2), 4.0), status="ambiguous")
     far = grid.middle[40] - grid.middle[5]
     assert found.share == pytest.approx(0.7) and found.mode == 5
     np.testing.assert_allclose(found.covariance, (0.1 + 1 / 12) * np.eye(3) + 0.3 * np.outer(far, far))

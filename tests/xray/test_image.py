@@ -130,7 +130,7 @@ def test_motion_blurs_a_wire_along_its_path(imager):
     plane = imager.plane((0.0, 0.0))
     nodes = imager.isocenter + np.linspace(-5, 5, 9)[:, None] * np.array([0.0, 0.0, 1.0])
     speed = np.tile([250.0, 0.0, 0.0], (9, 1))  # 2 mm in a pulse of 8 ms
-    still, moving = (imager._moving(plane, 0, nodes, velocity) for velocity in (None, speed))
+    still, moving = (imager.wire(plane, nodes, velocity=velocity) for velocity in (None, speed))
     columns = np.arange(512)
 
     def middle_and_variance(image):

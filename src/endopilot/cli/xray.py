@@ -114,7 +114,7 @@ def locate_command(
     count = {status: sum(one.status == status for one in found) for status in ("found", "ambiguous", "not found")}
     counted = ", ".join(f"{number} {status}" for status, number in count.items())
     if picture is not None or page is not None:
-        from endopilot.xray.locate_picture import draw_locations, write_page  # matplotlib is slow to import
+        from endopilot.xray.frames import draw_locations, write_page  # matplotlib is slow to import
 
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "frames.png" if picture is None else picture

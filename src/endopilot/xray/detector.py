@@ -25,8 +25,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import Image, Places, View
 from endopilot.xray.projector import Shadow
-from endopilot.xray.tip_posterior import TipEstimate, Told, estimated
-from endopilot.xray.vessel_grid import VesselGrid, make_grid, with_catheter
+from endopilot.xray.tip_posterior import TipEstimate, Told, VesselGrid
 from endopilot.xray.wire_end import BLUR_PX, refined
 from endopilot.xray.wire_likelihood import Seat, Shifts, end_log, or_folded, possible_shifts, tell, way_to
 
@@ -39,7 +38,7 @@ _MOST = 12.0
 PARAMETERS = Path(__file__).parent / "ridge.json"
 
 
-def ridge_evidence(signal: Image, photons: float, rough: Image | float = 0.0) -> Signal:
+def ridge_evidence(signal: Image, photons: float, rough: Image | float = 0.0) -> Image:
     """Return the logarithm of how much likelier each pixel is on a wire than off it: a logistic regression on ridges.
 
     Of `features`, whose arguments these are, and the products of any two.
@@ -91,7 +90,7 @@ def _curvatures(image: Image) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndar
     return 0.125 * (down + right), 0.125 * np.sqrt((down - right) ** 2 + 4 * mixed**2)
 
 
-def _smoother(image: Image, done_px: float, scale_px: float) -> Signal:
+def _smoother(image: Image, done_px: float, scale_px: float) -> Image:
     """Return an image, smoothed already, smoothed to a larger standard deviation: every other pixel will do."""
     rows, columns = image.shape
     part = gaussian_filter(image[::2, ::2], 0.5 * float(np.sqrt(scale_px**2 - done_px**2)))
@@ -169,7 +168,7 @@ class TipDetector:
     def __init__(self, anatomy: Anatomy, device: Wire) -> None:
         """Take the vessel and the wire."""
         self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
-        self.grid: VesselGrid = with_catheter(make_grid(anatomy.tree, step_mm=_PLACES_MM), anatomy, CATHETER_MM)
+        self.grid: VesselGrid = VesselGrid.of(anatomy.tree, step_mm=_PLACES_MM).with_catheter(anatomy, CATHETER_MM)
         self._room_mm = self.grid.radius - device.tip_radius_mm + _SLACK_MM
         self._seat = Seat(anatomy)
         behind, size = catheter_lumen_points(anatomy)
@@ -204,17 +203,13 @@ class TipDetector:
         displaced: Float[np.ndarray, "3 3"] | None = None,
         contrast: Sequence[Image] | None = None,
     ) -> Exposure:
-        """Return the evidence of a wire in the images of one exposure.
+        """Return the evidence of a wire in the images of one exposure, whose views are in the CT's frame.
 
-        Args:
-            views: of the images, in the CT's frame (`Registration.views`).
-            signals: from `XrayImager.signal`.
-            photons: that a pixel of usual brightness counts, in each image.
-            lines: in images of the same views without a wire, as `lines` has them: none of them is the wire's.
-            displaced: covariance of how far the vessel lies from where the views have it, if it does not lie there,
-                mm²; by `DISPLACED_MM` if not given.
-            contrast: how much darker contrast makes each image, in whatever shape it fills, as other times show it,
-                powers of e, infinite where nothing is seen; none but what fills the CT's lumen if not given.
+        A pixel of usual brightness counts so many photons in each. `lines` are those of images of the same views
+        without a wire; `displaced` is the covariance of how far the vessel lies from where the views have it, if it
+        does not lie there, mm², by `DISPLACED_MM` if not given. `contrast` is how much darker contrast makes each
+        image, in whatever shape it fills, as other times show it, powers of e, infinite where nothing is seen; none but
+        what fills the CT's lumen if not given.
         """
         dark = contrast or [np.zeros_like(one) for one in signals]
         plain, evidence = zip(*map(self._read, views, signals, photons, dark), strict=True)
@@ -233,7 +228,7 @@ class TipDetector:
 
         An ambiguous one is as uncertain as the places are far apart; on a line from before the wire may end elsewhere.
         """
-        found = estimated(self.grid, told, ends, _MODE_MM)
+        found = self.grid.estimate(told, ends, _MODE_MM)
         found = refined(found, seen.views, seen.plain, seen.evidence, self._radius_mm)
         found = replace(found, log_odds=log_odds)
         if log_odds < _LEAST_LOG_ODDS:
@@ -281,12 +276,12 @@ class TipDetector:
         evidence[box] = own_share(dark[box], photons) * self._saturated(ridge_evidence(plain[box], photons, rough))
         return plain, evidence
 
-    def _saturated(self, log_ratio: Image) -> Signal:
+    def _saturated(self, log_ratio: Image) -> Image:
         """Return evidence that no single pixel can overrule all others with."""
         likelier = np.exp(np.clip(log_ratio, -30, 30))
         return np.log((likelier + _HIDDEN_SHARE) / (1 + _ALIKE_SHARE * likelier)).astype(np.float32)
 
-    def without_contrast(self, view: View, signal: Image, box: tuple[slice, slice] | None = None) -> Signal:
+    def without_contrast(self, view: View, signal: Image, box: tuple[slice, slice] | None = None) -> Image:
         """Return an image without the contrast in the vessel, whose strength is estimated from a part of the image."""
         box = box or (slice(None), slice(None))
         width_mm = 0.5 * self._anatomy.distance_map.spacing_mm

@@ -2,8 +2,8 @@
 
 What does not move (`Plane`) is computed once for a direction of the C-arm: line integrals of the attenuation through a
 CT, the path through the lumen, the guiding catheter, the scattered light. A frame adds the wire, the catheters that are
-driven with it, and the noise. All lengths and
-attenuations are physical; docs/concepts/images.md says where the constants come from.
+driven with it, and the noise. All lengths and attenuations are physical; docs/concepts/images.md says where the
+constants come from.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ class XrayImager:
         moving = [velocity, *(catheter_velocities or [None] * len(catheters))]
         for number, (line, its_velocity) in enumerate(zip([nodes, *catheters], moving, strict=True)):
             if len(line):
-                attenuation += self._moving(plane, number, line, its_velocity)
+                attenuation += self.wire(plane, line, number=number, velocity=its_velocity)
         if contrast > 0:
             attenuation += np.float32(contrast * config.iodine_mm) * plane.vessel_mm
         light = np.exp(np.negative(attenuation, out=attenuation), out=attenuation)
@@ -299,13 +299,20 @@ class XrayImager:
             value = value + _ROADMAP_GREY * (1 - np.exp(-np.float32(self.config.iodine_mm) * roadmap))
         return np.clip(value, 0, 255).astype(np.uint8)
 
-    def wire(self, plane: Plane, *lines: Float[np.ndarray, "_ 3"], number: int = 0) -> Image:
-        """Return the attenuation of the wire, or of a catheter around it, along each ray, mean over some places of it.
+    def wire(self, plane: Plane, nodes: Places, *, number: int = 0, velocity: Places | None = None) -> Image:
+        """Return the attenuation of the wire, or of a catheter around it, along each ray, mean over a pulse.
 
-        At each its nodes begin at the tip, LPS mm. The wire's number is 0, then come the catheters from the inside out.
+        The pulse ends with the device at its nodes, which begin at the tip, LPS mm; it is at rest if no velocity of
+        them is given, mm/s. The wire's number is 0, then come the catheters from the inside out.
         """
-        config, radius = self.config, self.stack.wire.tip_radius_mm
+        config, lines = self.config, [nodes]
+        if velocity is not None:
+            path_px = float(np.linalg.norm(velocity, axis=1).max()) * config.pulse_s
+            path_px *= plane.view.scale / config.geometry.source_to_isocenter_mm
+            times = config.pulse_s * (np.arange(count := min(1 + int(2 * path_px), _MOST_PULSES)) + 0.5) / count
+            lines = [nodes - time * velocity for time in times]
         if number == 0:
+            radius = self.stack.wire.tip_radius_mm
             step_mm = _WIRE_STEP_MM * max(1.0, config.geometry.pixel_mm / CArmGeometry().pixel_mm)
             how = {"opaque_tip_mm": config.opaque_tip_mm, "step_mm": step_mm, "coil_mm": config.coil_mm}
             draw, width_mm = partial(wire_points, radius_mm=radius, **how), radius / 2
@@ -313,7 +320,7 @@ class XrayImager:
             catheter = self.stack.catheters[number - 1]
             draw = partial(driven_catheter_points, catheter)
             width_mm = (catheter.tip_radius_mm - catheter.inner_diameter_mm / 2) / np.sqrt(12)
-        drawn = [draw(in_catheter(self.anatomy, nodes, self._guide)) for nodes in lines]
+        drawn = [draw(in_catheter(self.anatomy, line, self._guide)) for line in lines]
         points, sizes = (np.concatenate(each) for each in zip(*drawn, strict=True))
         shadow = Shadow(plane.view, config.pixels, points, plane.placed)
         return shadow.of(sizes / len(lines), width_mm=width_mm, blur_px=self.blur_px(plane.zoom))
@@ -329,15 +336,6 @@ class XrayImager:
         """Return how many photons a pixel of usual brightness counts; exposure control keeps the detector's dose."""
         config, side = self.config, self.config.geometry.pixel_mm / plane.zoom
         return PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * side**2
-
-    def _moving(self, plane: Plane, number: int, nodes: Places, velocity: Places | None) -> Image:
-        """Return the mean attenuation of a device over the pulse, which ends with the device at its nodes."""
-        if velocity is None:
-            return self.wire(plane, nodes, number=number)
-        path_px = float(np.linalg.norm(velocity, axis=1).max()) * self.config.pulse_s
-        path_px *= plane.view.scale / self.config.geometry.source_to_isocenter_mm
-        times = self.config.pulse_s * (np.arange(count := min(1 + int(2 * path_px), _MOST_PULSES)) + 0.5) / count
-        return self.wire(plane, *(nodes - time * velocity for time in times), number=number)
 
     def blur_px(self, zoom_factor: float) -> float:
         """Return the blur of focal spot and scintillator, standard deviation, pixels of the image."""

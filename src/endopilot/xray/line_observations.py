@@ -17,7 +17,7 @@ from endopilot.anatomy.tree import smoothed
 from endopilot.lines import length_along, places_on
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import Places, Vector, View
-from endopilot.xray.vessel_grid import VesselGrid
+from endopilot.xray.tip_posterior import VesselGrid
 
 Line = Float[np.ndarray, "_ 2"]
 _SAMPLE_MM = 6.0
@@ -131,7 +131,7 @@ def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Places) -> See
         shown=shown,
         slope=slope,
         scale=scale,
-        along=grid.along(shown) / usual,
+        along=grid.summed(np.linalg.norm(shown - shown[grid.parent], axis=1)) / usual,
         end_mm=end / usual,
         rough_mm=rough / usual,
     )

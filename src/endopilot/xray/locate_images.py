@@ -28,8 +28,7 @@ from endopilot.xray.image import isocenter_of
 from endopilot.xray.line_observations import shift_onto
 from endopilot.xray.registration import Registration, lay, observed_contrast, register
 from endopilot.xray.tip_filter import TipLocation, located
-from endopilot.xray.tip_posterior import LocateConfig, TipEstimate, told_by_later
-from endopilot.xray.vessel_grid import VesselGrid
+from endopilot.xray.tip_posterior import LocateConfig, TipEstimate, VesselGrid
 
 _EMPTY_SHARE = 0.9
 """A pixel's light where no contrast passes is this quantile of the frames': contrast and wire darken fewer."""
@@ -199,7 +198,7 @@ def _registered(
     return cines, laid, known, best, (*notes, *([said] if said else []))
 
 
-def _empty(cine: XrayCine) -> Signal:
+def _empty(cine: XrayCine) -> Image:
     """Return the light without contrast."""
     return np.quantile(cine.signals, _EMPTY_SHARE, axis=0).astype(np.float32)
 
@@ -274,8 +273,8 @@ def _followed(
     tells = [sees and one.status != "not found" for sees, one in zip(clear, found, strict=True)]
     said = [one._replace(log=anywhere + (one.log if own else 0.0)) for own, (one, _) in zip(tells, told, strict=True)]
     frames = np.maximum(np.diff(times_s), 1e-3) / _FRAME_S
-    later = told_by_later(grid, travel, said, frames)
-    before = told_by_later(grid, travel, said[::-1], frames[::-1])[::-1]
+    later = grid.told_by_later(travel, said, frames)
+    before = grid.told_by_later(travel, said[::-1], frames[::-1])[::-1]
     odds = np.where(tells, [one.log_odds for one in found], 0.0)
     for k, one in enumerate(seen):
         others = anywhere + later[k] + before[k]

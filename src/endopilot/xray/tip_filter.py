@@ -35,8 +35,7 @@ from endopilot.xray.line_observations import (
     shift_onto,
     shown_by,
 )
-from endopilot.xray.tip_posterior import LocateConfig, Status, TipEstimate, Told, estimated, goes, told_by_later
-from endopilot.xray.vessel_grid import VesselGrid, make_grid
+from endopilot.xray.tip_posterior import LocateConfig, Status, TipEstimate, Told, VesselGrid
 
 _STEP_MM = 1.0
 """Distance of the grid's places, mm."""
@@ -150,7 +149,7 @@ class TipFilter:
         """Take the vessel and what sees it; `config` says what is known before the first frame."""
         self.config = config or LocateConfig()
         self._tree, self._cameras = tree, tuple(cameras)
-        self.grid: VesselGrid = make_grid(tree, step_mm=_STEP_MM)
+        self.grid: VesselGrid = VesselGrid.of(tree, step_mm=_STEP_MM)
         self._way = self.grid.straightened(self.config.stiff_mm)
         count = len(self.grid.middle)
         self._centre = self._way.mean(axis=0)
@@ -216,7 +215,7 @@ class TipFilter:
         if self._registers_itself:
             return {}
         frames = np.diff(np.array([one.frame for one in self._seen], dtype=float))
-        told = told_by_later(self.grid, self.config, [one.told for one in self._seen], frames)
+        told = self.grid.told_by_later(self.config, [one.told for one in self._seen], frames)
         return {one.frame: self._answer(one, one.before + later) for one, later in zip(self._seen, told, strict=True)}
 
     def _begin(self, lines: Sequence[Line | None]) -> bool:
@@ -240,7 +239,7 @@ class TipFilter:
 
     def _predict(self, frames: int) -> None:
         """Let the tip travel and the pose drift for some frames; what comes together at a place is one normal there."""
-        flow = goes(self.grid, self.config, float(frames)) * np.exp(self._log)[:, None]
+        flow = self.grid.goes(self.config, float(frames)) * np.exp(self._log)[:, None]
         total = flow.sum(axis=0)
         flow /= total
         drift = np.diag(np.array([*[_DRIFT_MM] * 3, *[_DRIFT_RAD] * 3]) ** 2)
@@ -307,7 +306,7 @@ class TipFilter:
 
     def _answer(self, seen: _Seen, prior: Float[np.ndarray, "m"]) -> TipLocation:
         """Return where the tip is, given what other frames say of the places."""
-        found, places = estimated(self.grid, seen.told, prior, _NEAR_MM), seen.told.places
+        found, places = self.grid.estimate(seen.told, prior, _NEAR_MM), seen.told.places
         near = places[np.linalg.norm(self.grid.middle[places] - self.grid.middle[found.mode], axis=1) <= _NEAR_MM]
         place = near[np.linalg.norm(self.grid.middle[near] - found.position, axis=1).argmin()]
         best = np.searchsorted(places, found.mode)

@@ -56,11 +56,8 @@ def fit_end(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]] | None:
     """Return where a dark line ends, and its covariance, pixels²; None if no line ends there, or the image does.
 
-    Args:
-        signal: the image.
-        guess: where the end should be: to the right of the image's middle and up from it, pixels; as what is returned.
-        forwards: direction along the line to its end; any length.
-        width_px: standard deviation of the line's profile, pixels.
+    `guess` is where the end should be, to the right of the image's middle and up from it, pixels, as is what is
+    returned; `forwards` leads along the line to its end; `width_px` is the standard deviation of its profile.
     """
     middle = (len(signal) - 1) / 2
     column, row = np.rint([middle + guess[0], middle - guess[1]]).astype(int)
@@ -103,10 +100,7 @@ def fit_end(
 def refined(
     found: TipEstimate, views: Sequence[View], signals: Sequence[Image], evidence: Sequence[Image], radius_mm: float
 ) -> TipEstimate:
-    """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift.
-
-    Views, signals without contrast and evidence are those of `TipDetector.look`.
-    """
+    """Return a tip after each image's fit of the wire's end: a Kalman update of its place and the vessel's shift."""
     mean, spread = found.mean, found.spread
     wire = found.wire[-_END_PLACES:] - found.position
 
@@ -149,11 +143,8 @@ def _ends(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
     """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance.
 
-    Args:
-        image: the evidence.
-        guess: to the right of the image's middle and up from it, pixels.
-        axes: unit vectors along the wire and across it.
-        expected: covariance of the end about the guess, along and across, pixels².
+    Unit vectors, along the wire and across it, are the axes, also of what is expected: the end's covariance about the
+    guess, pixels².
     """
     reach, sides = np.ceil(2.5 * np.sqrt(np.diag(expected)))
     along, across = np.arange(-reach - _LEAD_PX, reach + 1), np.arange(-sides, sides + 1)

@@ -22,8 +22,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import CATHETER_MM, catheter_points
 from endopilot.xray.carm import Image, Vector, View
 from endopilot.xray.projector import Shadow
-from endopilot.xray.tip_posterior import Told
-from endopilot.xray.vessel_grid import VesselGrid
+from endopilot.xray.tip_posterior import Told, VesselGrid
 
 _SHORTER_SHARE, _LONGER_SHARE, _NEAR_MM = 0.1, 0.04, 2.0
 """The way to the tip differs from the inserted length by 2 mm, and a tenth of it where it is shorter, since wires snake
