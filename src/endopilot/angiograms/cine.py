@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
@@ -18,10 +18,11 @@ from endopilot.angiograms.flow import Flow, grow
 from endopilot.lines import length_along, places_on
 from endopilot.simulation.motion import place, relative
 from endopilot.xray.absorbers import GUIDE_WALL_MM, catheter_line, in_catheter, is_coronary
-from endopilot.xray.carm import View, view_at, view_of
+from endopilot.xray.carm import Image, View, view_at, view_of
 from endopilot.xray.image import XrayImager
 from endopilot.xray.projector import Shadow
 
+Mask = Bool[np.ndarray, "rows columns"]
 CLASSES: Mapping[str, int] = {"vessel": 1, "contrast": 2, "guide": 4, "catheter": 8, "wire": 16}
 """Names of the masks, and their bits in a mask's file: vessel (its whole lumen), contrast (where half of the blood on
 the ray or more is contrast), guide (the guiding catheter), catheter (one that is driven) and wire."""
@@ -57,7 +58,7 @@ def stroke(
     return mask
 
 
-def laid_together(masks: Mapping[str, Bool[np.ndarray, "rows columns"]]) -> UInt8[np.ndarray, "rows columns"]:
+def laid_together(masks: Mapping[str, Mask]) -> UInt8[np.ndarray, "rows columns"]:
     """Return masks by name as one image, with the bits of `CLASSES`."""
     together = np.zeros(next(iter(masks.values())).shape, dtype=np.uint8)
     for name, mask in masks.items():
@@ -65,7 +66,7 @@ def laid_together(masks: Mapping[str, Bool[np.ndarray, "rows columns"]]) -> UInt
     return together
 
 
-def encoded(mask: Bool[np.ndarray, "rows columns"]) -> dict[str, Any]:
+def encoded(mask: Mask) -> dict[str, Any]:
     """Return COCO's run lengths of a mask, column after column: the first is of what the mask leaves out."""
     used = np.flatnonzero(mask.any(axis=0))
     left, right = (used[0], used[-1] + 1) if len(used) else (0, 0)
@@ -76,7 +77,7 @@ def encoded(mask: Bool[np.ndarray, "rows columns"]) -> dict[str, Any]:
     return {"size": list(mask.shape), "counts": (runs if runs[-1] else runs[:-1]).tolist()}
 
 
-def box_of(mask: Bool[np.ndarray, "rows columns"]) -> list[int]:
+def box_of(mask: Mask) -> list[int]:
     """Return left, top, width and height of what a mask holds, pixels."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return [int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1]
@@ -115,11 +116,11 @@ class Beam:
     """
 
     edges: tuple[int, int, int, int]
-    field: Float32[np.ndarray, "rows columns"]
-    attenuation: Float32[np.ndarray, "rows columns"]
+    field: Image
+    attenuation: Image
 
     @classmethod
-    def draw(cls, random: np.random.Generator, patient: Float32[np.ndarray, "rows columns"], pixel_mm: float) -> Beam:
+    def draw(cls, random: np.random.Generator, patient: Image, pixel_mm: float) -> Beam:
         """Draw what is in the beam of a patient, whose attenuation is given: the wedge covers the brightest side."""
         pixels = len(patient)
         at, blur = np.arange(pixels), _PENUMBRA_MM / pixel_mm
@@ -137,7 +138,7 @@ class Beam:
         return cls((left, pixels - right, upper, pixels - lower), field, attenuation)
 
 
-def _wedge(random: np.random.Generator, patient: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "r c"]:
+def _wedge(random: np.random.Generator, patient: Image) -> Image:
     """Return the attenuation of a filter whose edge lies across the image towards its brightest side."""
     middle = np.linspace(-0.5, 0.5, len(patient))
     turn = np.arange(0, 2 * np.pi, np.pi / 8)
@@ -147,7 +148,7 @@ def _wedge(random: np.random.Generator, patient: Float32[np.ndarray, "rows colum
     return (random.uniform(*_WEDGE) * np.clip((brightest - begin) / ramp, 0, 1)).astype(np.float32)
 
 
-def _cable(random: np.random.Generator, pixels: int, pixel_mm: float) -> Float32[np.ndarray, "rows columns"]:
+def _cable(random: np.random.Generator, pixels: int, pixel_mm: float) -> Image:
     """Return the attenuation of a cable that runs from above to an electrode, which may lie outside the image."""
     share, places = np.linspace(0, 1, 64)[:, None], random.uniform((-0.1, -0.1), (1.1, 1.6), (3, 2)) * pixels
     places[0, 1] = -1
@@ -158,7 +159,7 @@ def _cable(random: np.random.Generator, pixels: int, pixel_mm: float) -> Float32
     return gaussian_filter(drawn, _PENUMBRA_MM / 2 / pixel_mm)
 
 
-def shown(light: Float32[np.ndarray, "rows columns"], beam: Beam) -> Float32[np.ndarray, "rows columns"]:
+def shown(light: Image, beam: Beam) -> Image:
     """Return what a monitor shows of the logarithm of the light: pressed beyond `CLOSED` on either side of the middle,
     so that nothing is black or white, and even beyond the collimator's edges."""
     within = np.clip(light, CLOSED, -CLOSED)
@@ -166,9 +167,7 @@ def shown(light: Float32[np.ndarray, "rows columns"], beam: Beam) -> Float32[np.
     return np.float32(CLOSED) + beam.field * (within - np.float32(CLOSED))
 
 
-def harmonised(
-    light: Float32[np.ndarray, "rows columns"], beam: Beam, pixel_mm: float, span: float
-) -> Float32[np.ndarray, "rows columns"]:
+def harmonised(light: Image, beam: Beam, pixel_mm: float, span: float) -> Image:
     """Return what the C-arm takes off the logarithm of the light: of its slow part what spans more than `span`, and
     then the level that lies in the middle of the monitor's grey scale.
 
@@ -211,9 +210,9 @@ class CineFrame:
         lines_px: the same in the image, as heart and breath have moved them.
     """
 
-    signal: Float32[np.ndarray, "rows columns"]
+    signal: Image
     grey: UInt8[np.ndarray, "rows columns"]
-    masks: dict[str, Bool[np.ndarray, "rows columns"]]
+    masks: dict[str, Mask]
     lines_mm: dict[str, Float[np.ndarray, "_ 3"]]
     lines_px: dict[str, Float[np.ndarray, "_ 2"]]
 
@@ -291,7 +290,7 @@ class Cine:
         pressed = harmonised(light, beam, pixel_mm, float(random.uniform(*SPAN)))
         blur, period_s = imager.blur_px(1.0), 1 / config.frames_per_second
         reflux = imager.anatomy.insertion.position + random.normal(0, _REFLUX_MM, size=(_REFLUX, 3))
-        signal: Float32[np.ndarray, "rows columns"] | None = None
+        signal: Image | None = None
         speeds = [self.driven.velocity(device, period_s) for device in range(self.driven.proximal.shape[1])]
         width_mm, (points, sizes) = imager.anatomy.distance_map.spacing_mm / 2, self._lumen
         for number, placed in enumerate(self.placed):
@@ -358,12 +357,12 @@ class Cine:
 
     def _device_masks(
         self, lines_mm: dict[str, Float[np.ndarray, "_ 3"]], lines_px: dict[str, Float[np.ndarray, "_ 2"]], number: int
-    ) -> dict[str, Bool[np.ndarray, "rows columns"]]:
+    ) -> dict[str, Mask]:
         stack = self.imager.stack
         radius_mm = {"guide": self.imager.anatomy.catheter_radius_mm + GUIDE_WALL_MM, "wire": stack.wire.tip_radius_mm}
         driven = [name for name in lines_mm if name.startswith("catheter")]
         radius_mm |= {name: each.tip_radius_mm for name, each in zip(driven, stack.catheters, strict=False)}
-        masks: dict[str, Bool[np.ndarray, "rows columns"]] = {}
+        masks: dict[str, Mask] = {}
         for name, line in lines_mm.items():
             depth = (place(self.placed[number], line) - self.view.source) @ self.view.axes[2]
             drawn = stroke(lines_px[name], self.view.scale * radius_mm[name] / depth, self.config.image.pixels)

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.absorbers import across
+from endopilot.xray.carm import Places, Vector
 
 MIXING_S = 0.03
 """Time in which blood passes one well-mixed volume, s: an assumption. After one second of transit a sharp front is then
@@ -93,7 +94,7 @@ class Flow:
         self.section = np.concatenate([branch.section for branch in tree.branches])
         self.rate_ml_s, self.transit_s = inflow[self.branch], np.concatenate(transits)
 
-    def append(self, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], parent: int) -> None:
+    def append(self, points: Places, radius: Float[np.ndarray, "n"], parent: int) -> None:
         """Append a branch that leaves at a point, in which blood is as fast as at its begin by Murray's law."""
         rate = self.rate_ml_s[parent] * (radius[0] / self.radius[parent]) ** 3
         steps = np.linalg.norm(np.diff(points, axis=0, prepend=self.points[parent : parent + 1]), axis=1)
@@ -124,7 +125,7 @@ class Flow:
         excess = np.maximum(injection.rate(every) - self.inflow_ml_s, 0) * step
         return lfilter([1.0], [1.0, -np.exp(-step / _REFLUX_S)], excess)[np.rint(times_s / step).astype(int)]
 
-    def transit_of(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def transit_of(self, places: Places) -> Float[np.ndarray, "n"]:
         """Return the time, s, that blood takes from the ostium to the centerline nearest to each place, LPS mm."""
         return self.transit_s[KDTree(self.points).query(places)[1]]
 
@@ -144,9 +145,7 @@ _CURVATURE, _BENDS_MM = 0.08, 4.0
 curvature's 95th percentile is 0.12–0.17 /mm in thirty real trees."""
 
 
-def grow(
-    anatomy: Anatomy, flow: Flow, random: np.random.Generator
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def grow(anatomy: Anatomy, flow: Flow, random: np.random.Generator) -> tuple[Places, Float[np.ndarray, "n"]]:
     """Append fine branches to the flow's lines, and return them as small volumes.
 
     Returns:
@@ -178,11 +177,8 @@ def grow(
 
 
 def _sides(
-    points: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    centre: Float[np.ndarray, "3"],
-    random: np.random.Generator,
-) -> list[tuple[int, Float[np.ndarray, "3"], float, bool]]:
+    points: Places, radius: Float[np.ndarray, "n"], centre: Vector, random: np.random.Generator
+) -> list[tuple[int, Vector, float, bool]]:
     """Return the side branches of a line: where each leaves, its heading, its radius, mm, and if it dives."""
     found, whole, last = [], radius[0] ** 3, 0.0
     widest = np.maximum.accumulate(radius[::-1])[::-1]  # of what follows: a stenosis takes no blood away
@@ -203,13 +199,8 @@ def _sides(
 
 
 def _run(
-    place: Float[np.ndarray, "3"],
-    heading: Float[np.ndarray, "3"],
-    radius: float,
-    dives: bool,
-    centre: Float[np.ndarray, "3"],
-    random: np.random.Generator,
-) -> Float[np.ndarray, "n 3"]:
+    place: Vector, heading: Vector, radius: float, dives: bool, centre: Vector, random: np.random.Generator
+) -> Places:
     """Return the places of a branch, at equal distances."""
     places, kept = [], np.exp(-_STEP_MM / _BENDS_MM)
     shocks = random.normal(

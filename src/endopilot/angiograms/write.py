@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt16
+from jaxtyping import Float, UInt16
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
 from pydicom.valuerep import format_number_as_ds
@@ -24,6 +24,7 @@ from endopilot.imaging.segment import segment
 from endopilot.imaging.volume import read_volume, write_volume
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM, is_coronary, surroundings
+from endopilot.xray.carm import Image, Vector
 from endopilot.xray.image import XrayImager
 
 _BITS = 12
@@ -36,7 +37,7 @@ _KV, _MA, _THIN_MM, _THICK_MM = (81.0, 125.0), (474.0, 841.0), 150.0, 300.0
 patient: an assumption."""
 
 
-def stored(signal: Float32[np.ndarray, "rows columns"], window: float) -> UInt16[np.ndarray, "rows columns"]:
+def stored(signal: Image, window: float) -> UInt16[np.ndarray, "rows columns"]:
     """Return a frame as its file holds it: the logarithm of the light, 12 bits, wider than a monitor's half-window."""
     value = np.float32(_LARGEST / 2) * (1 + signal / np.float32(_WIDER * window))
     return np.clip(np.rint(value), 0, _LARGEST).astype("<u2")
@@ -63,7 +64,7 @@ def _decimal(value: float) -> str:
     return format_number_as_ds(float(value))
 
 
-def _towards(axis: Float[np.ndarray, "3"]) -> str:
+def _towards(axis: Vector) -> str:
     """Return where an axis of the image points in the patient: the letters of PS3.3 C.7.6.1.1.1, the largest first."""
     letters = [pair[int(part > 0)] for pair, part in zip(("RL", "AP", "FH"), axis, strict=True)]
     return "".join(letters[k] for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > np.sin(np.pi / 12))

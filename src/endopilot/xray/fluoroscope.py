@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -118,6 +119,31 @@ class CArm:
         """Return what an exposure shows of a wire: nodes from the foremost tip on, its tip, and the heading there."""
         raise NotImplementedError
 
+    def _measured(
+        self, places: Places, covariances: Float[np.ndarray, "n 3 3"], weight: Float[np.ndarray, "n"] | None = None
+    ) -> TipMeasurement:
+        """Return the measurement of a tip at one of some places, LPS mm, the likeliest first.
+
+        It has a covariance around each place, if it is there, mm²; each is as likely as its weight says, or equally.
+        """
+        share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
+        tips, insertion = self._project(places), self._anatomy.insertion
+        branch, abscissa = int(tips.branch[0]), float(tips.abscissa[0])
+        line, tangent = self._anatomy.tree.branches[branch].centerline, np.asarray(insertion.direction)
+        centre = insertion.position + abscissa * tangent
+        if abscissa > 0:
+            at = np.array([abscissa])
+            centre, tangent = (places_on(of, line.abscissa, at)[0] for of in (line.points, tangents(line.points)))
+        outwards = places[0] - centre
+        outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
+        axes = np.array([tangent, outwards, np.cross(tangent, outwards)])
+        within = np.einsum("p,pij->ij", share, covariances)
+        along, out, around = np.sqrt(np.einsum("ai,ij,aj->a", axes, within, axes)).tolist()
+        off, tip = places - places[0], np.stack([tips.abscissa, tips.offset], axis=-1)
+        along, out = np.hypot([along, out], np.sqrt(share @ (tip - tip[0]) ** 2)).tolist()
+        covariance = within + np.einsum("p,pi,pj->ij", share, off, off)
+        return TipMeasurement(places[0], abscissa, float(tips.offset[0]), branch, covariance, (along, out), around)
+
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
 
@@ -171,38 +197,6 @@ class FluoroscopeConfig:
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
 
 
-def measurement_at(
-    project: TipProjector,
-    anatomy: Anatomy,
-    places: Places,
-    covariances: Float[np.ndarray, "n 3 3"],
-    weight: Float[np.ndarray, "n"] | None = None,
-) -> TipMeasurement:
-    """Return the measurement of a tip at one of some places, LPS mm, the likeliest first.
-
-    It has a covariance around each place, if it is there, mm², and each is as likely as its weight says, or equally.
-    """
-    share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
-    tips = project(places)
-    branch, abscissa = int(tips.branch[0]), float(tips.abscissa[0])
-    line, tangent = anatomy.tree.branches[branch].centerline, np.asarray(anatomy.insertion.direction)
-    centre = anatomy.insertion.position + abscissa * tangent
-    if abscissa > 0:
-        at = np.array([abscissa])
-        centre, tangent = (places_on(of, line.abscissa, at)[0] for of in (line.points, tangents(line.points)))
-    outwards = places[0] - centre
-    outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
-    axes = np.array([tangent, outwards, np.cross(tangent, outwards)])
-    within = np.einsum("p,pij->ij", share, covariances)
-    along, out, around = np.sqrt(np.einsum("ai,ij,aj->a", axes, within, axes)).tolist()
-    off, tip = places - places[0], np.stack([tips.abscissa, tips.offset], axis=-1)
-    tip_sd = np.hypot([along, out], np.sqrt(share @ (tip - tip[0]) ** 2)).tolist()
-    covariance = within + np.einsum("p,pi,pj->ij", share, off, off)
-    return TipMeasurement(
-        places[0], abscissa, float(tips.offset[0]), branch, covariance, (tip_sd[0], tip_sd[1]), around
-    )
-
-
 class Fluoroscope(CArm):
     """A C-arm of assumed errors of detection."""
 
@@ -242,7 +236,7 @@ class Fluoroscope(CArm):
         covariances = np.linalg.inv(information)
         # The likelihood of a place is that of its best point by the volume of its errors.
         weight = np.exp(0.5 * (cost[0] - cost)) * np.sqrt(np.linalg.det(covariances))
-        return measurement_at(self._project, self._anatomy, places, covariances, weight)
+        return self._measured(places, covariances, weight)
 
     def catheter_axis(self, axis: Vector, random: np.random.Generator) -> Vector:
         """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
@@ -431,11 +425,10 @@ def make_c_arm(
     Raises:
         InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
     """
-    anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
+    device = navigation.device
+    how: Any = {"config": config, "known_motion": navigation.known_motion, "registration_mm": registration_mm}
     if navigation.xray == "assumed":
-        return Fluoroscope(
-            anatomy, device.tip_radius_mm, config=config, known_motion=known, registration_mm=registration_mm
-        )
+        return Fluoroscope(navigation.anatomy, device.tip_radius_mm, **how)
     from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
 
     if navigation.catheters:
@@ -443,6 +436,4 @@ def make_c_arm(
         raise InputError(
             f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
         )
-    return ImageFluoroscope(
-        anatomy, device, config=config, seed=seed, known_motion=known, registration_mm=registration_mm
-    )
+    return ImageFluoroscope(navigation.anatomy, device, seed=seed, **how)

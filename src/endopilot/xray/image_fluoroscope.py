@@ -18,7 +18,7 @@ from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Image, Places, Pose, Vector, view_at
 from endopilot.xray.detector import DISPLACED_MM, TipDetector
-from endopilot.xray.fluoroscope import CArm, FluoroscopeConfig, TipMeasurement, measurement_at
+from endopilot.xray.fluoroscope import CArm, FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.registration import Registration, register, register_motion, take_run
 
@@ -115,7 +115,7 @@ class ImageFluoroscope(CArm):
             return None
         if self.known_motion is None and found.status == "found":
             self.shift, self.spread = self.shift + found.shift, found.spread[3:, 3:] + DRIFTS_MM**2 * np.eye(3)
-        return measurement_at(self._project, self._anatomy, found.position[None], found.covariance[None])
+        return self._measured(found.position[None], found.covariance[None])
 
     def _signal(self, plane: Plane, nodes: Places, random: np.random.Generator, contrast: float = 0.0) -> Image:
         return self._imager.signal(plane, nodes, contrast=contrast, seed=int(random.integers(2**31)))

@@ -49,6 +49,11 @@ _FEWEST, _STIRS_MM = 4, 1.0
 """From so many frames on, how far their vessels lie apart says how far it moves; and by how much more at least, mm."""
 _ELSEWHERE_MM = 4.0
 """A tip this far from where all frames together have it is sought anew."""
+_OTHERWISE = (
+    "PositionerPrimaryAngle has the other sign (RAO, LAO)",
+    "PositionerSecondaryAngle has the other sign (cranial, caudal)",
+    "the image is mirrored left to right",
+)
 _FRAME_S = 0.133
 """Time of a frame at which `LocateConfig.travel_mm` is meant, s: 7.5 frames a second, usual in fluoroscopy."""
 
@@ -121,15 +126,9 @@ def locate_in_images(
     for frame, one in enumerate(found):
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
         moved = laid[frame][0].move(one.position + one.shift, isocenter) - one.position
-        if one.status == "not found":
-            tips.append(TipLocation.nowhere(frame))
-            continue
         at = project(one.position[None])
-        tips.append(
-            located(
-                anatomy.tree, frame, one, (int(at.branch[0]), float(at.abscissa[0])), moved_mm=moved, residual_mm=np.nan
-            )
-        )
+        place = int(at.branch[0]), float(at.abscissa[0])
+        tips.append(located(anatomy.tree, frame, one, place, moved_mm=moved, residual_mm=np.nan))
     return ImagesLocated(
         tips=tuple(tips),
         wires=tuple(None if one.status == "not found" else one.wire for one in found),
@@ -238,11 +237,7 @@ def _read_otherwise(
     for mirrored, first, second in product((False, True), (1, -1), (1, -1)):
         if any(one.camera.angles_deg is None for one in cines) and (first, second) != (1, 1):
             continue
-        changes = [
-            *(["PositionerPrimaryAngle has the other sign (RAO, LAO)"] if first < 0 else []),
-            *(["PositionerSecondaryAngle has the other sign (cranial, caudal)"] if second < 0 else []),
-            *(["the image is mirrored left to right"] if mirrored else []),
-        ]
+        changes = [what for what, so in zip(_OTHERWISE, (first < 0, second < 0, mirrored), strict=True) if so]
         said = f"the vessel fits the images only if {' and '.join(changes)}; taken so" if changes else ""
         seen = []
         for one in cines:

@@ -247,29 +247,25 @@ class _Comparison:
     blur: float
     config: ImageConfig
 
-    def expected(self, sought: Float[np.ndarray, "k"]) -> list[list[np.ndarray]]:
-        """Return what contrast would add to each image: everywhere alike, and, if it may, growing along the vessel."""
-        (points, size, along), moments = self.lumen, []
-        fillings = (size, size * along) if along.any() else (size,)
-        coarse = [view.magnified(1 / self.averaged) for view in self.views]
-        for placed in self.sought.maps(sought):
-            shadows = [Shadow(view, self.config.pixels // self.averaged, points, placed) for view in coarse]
-            parts = [[one.of(each, blur_px=self.blur) for each in fillings] for one in shadows]
-            moments.append([self.config.iodine_mm * np.stack(two) for two in parts])
-        return moments
-
     def fitted(self, sought: Float[np.ndarray, "k"]) -> list[list[tuple[np.ndarray, np.ndarray, float]]]:
         """Return for each image what is expected, what is observed, and how strong the contrast shows.
 
         Unless the vessel is filled alike, by an injection of one's own, nobody knows how strong it shows, how that
         changes along the vessel as the blood carries it, and on which ground: each is what fits best.
         """
-        pairs = zip(self.expected(sought), self.observed, strict=True)
-        return [[self._scaled(*one) for one in zip(*moment, strict=True)] for moment in pairs]
+        (points, size, along), pixels = self.lumen, self.config.pixels // self.averaged
+        fillings, found = (size, size * along) if along.any() else (size,), []
+        for placed, observed in zip(self.sought.maps(sought), self.observed, strict=True):
+            found.append([])
+            for view, theirs in zip(self.views, observed, strict=True):
+                shadow = Shadow(view.magnified(1 / self.averaged), pixels, points, placed)
+                parts = self.config.iodine_mm * np.stack([shadow.of(each, blur_px=self.blur) for each in fillings])
+                found[-1].append(self._scaled(parts, theirs))
+        return found
 
     def _scaled(self, parts: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         along = self.lumen[2]
-        if not along.any():
+        if len(parts) == 1:
             return parts[0], theirs, 1.0
         flat = np.stack([part - part.mean() for part in parts]).reshape(2, -1)
         theirs = theirs - theirs.mean()
@@ -306,17 +302,15 @@ class _Comparison:
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
         """Return the correlation of what was expected and observed around the vessel, at the worst moment."""
-        return min(_correlation(moment) for moment in self.fitted(sought))
-
-
-def _correlation(images: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> float:
-    pairs = [((ours - ours.min()).ravel(), theirs.ravel()) for ours, theirs, _ in images]
-    ours, theirs = (np.concatenate(both) for both in zip(*pairs, strict=True))
-    near = ours > 0.02 * ours.max()
-    wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
-    if wide.sum() < 3 or np.ptp(theirs[wide]) == 0:
-        return 0.0
-    return float(np.corrcoef(ours[wide], theirs[wide])[0, 1])
+        found = []
+        for images in self.fitted(sought):
+            ours = np.concatenate([(one - one.min()).ravel() for one, _, _ in images])
+            theirs = np.concatenate([one.ravel() for _, one, _ in images])
+            near = ours > 0.02 * ours.max()
+            wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
+            tells = wide.sum() >= 3 and np.ptp(theirs[wide]) > 0
+            found.append(float(np.corrcoef(ours[wide], theirs[wide])[0, 1]) if tells else 0.0)
+        return min(found)
 
 
 def observed_contrast(

@@ -103,6 +103,8 @@ class TipLocation:
 
 def located(tree: VesselTree, frame: int, found: TipEstimate, place: tuple[int, float], **rest: Any) -> TipLocation:
     """Return a location, given branch and abscissa, mm, of the place, and how the vessel and the line lie."""
+    if found.status == "not found":
+        return TipLocation.nowhere(frame)
     branch, abscissa = place
     line = tree.branches[branch]
     section = tree.section_names[line.section[np.abs(line.centerline.abscissa - abscissa).argmin()]]
