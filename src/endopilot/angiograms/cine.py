@@ -18,7 +18,7 @@ from endopilot.angiograms.flow import Flow, grow
 from endopilot.lines import length_along, places_on
 from endopilot.simulation.motion import place, relative
 from endopilot.xray.absorbers import GUIDE_WALL_MM, catheter_line, in_catheter, is_coronary
-from endopilot.xray.carm import Image, View, view_at, view_of
+from endopilot.xray.carm import Affine, Image, View, view_at, view_of
 from endopilot.xray.image import XrayImager
 from endopilot.xray.projector import Shadow
 
@@ -264,7 +264,7 @@ class Cine:
         self.driven = drive_devices(config, draw, anatomy, imager.stack) if draw.devices else none
 
     @cached_property
-    def projection(self) -> Float[np.ndarray, "3 4"]:
+    def projection(self) -> Affine:
         """Matrix from LPS mm of the CT to (column, row, 1) times the depth: homogeneous pixels."""
         right, up, beam = self.view.axes
         middle = (self.config.image.pixels - 1) / 2
@@ -291,18 +291,16 @@ class Cine:
         blur, period_s = imager.blur_px(1.0), 1 / config.frames_per_second
         reflux = imager.anatomy.insertion.position + random.normal(0, _REFLUX_MM, size=(_REFLUX, 3))
         signal: Image | None = None
-        speeds = [self.driven.velocity(device, period_s) for device in range(self.driven.proximal.shape[1])]
         width_mm, (points, sizes) = imager.anatomy.distance_map.spacing_mm / 2, self._lumen
         for number, placed in enumerate(self.placed):
             shadow = Shadow(self.view, config.image.pixels, points, placed)
             lumen = shadow.of(sizes, width_mm=width_mm)
-            masks = {"vessel": lumen > LUMEN_MM}
-            path = np.zeros_like(lumen)
+            vessel, path = lumen > LUMEN_MM, np.zeros_like(lumen)
+            masks = {"vessel": vessel, "contrast": np.zeros_like(vessel)}
             if draw.injection is not None:
                 share = np.interp(self._transit_s, self._transit, self._shares[number])
                 path = shadow.of(share * sizes, width_mm=width_mm, blur_px=blur)
-            masks["contrast"] = masks["vessel"] & (path > CONTRAST_SHARE * lumen)
-            if draw.injection is not None:
+                masks["contrast"] = vessel & (path > CONTRAST_SHARE * lumen)
                 if number / config.frames_per_second > draw.injection.start_s:  # saline fills the catheter before
                     path += imager.cloud("guide lumen", self.view, 1.0, placed)
                 volume = self._reflux_mm3[number] / _REFLUX
@@ -311,8 +309,8 @@ class Cine:
             plane = replace(first, background=background, vessel_mm=path, placed=placed)
             lines, was = self.driven.nodes[number], relative(self._before[number], placed)
             moving = [
-                speed[number] + (nodes - place(was, nodes)) / max(config.image.pulse_s, 1e-9)
-                for speed, nodes in zip(speeds, lines, strict=True)
+                speed + (nodes - place(was, nodes)) / max(config.image.pulse_s, 1e-9)
+                for speed, nodes in zip(self.driven.velocity(number, period_s), lines, strict=True)
             ]
             signal = imager.signal(
                 plane,

@@ -160,16 +160,12 @@ class Driven:
     proximal: Float[np.ndarray, "frames devices 2"]
     redrawn: int = 0
 
-    def velocity(self, device: int, period_s: float) -> list[Float[np.ndarray, "_ 3"]]:
-        """Return the velocity of a device's nodes at each frame, mm/s: that of places so far behind its tip."""
-        lines = [nodes[device] for nodes in self.nodes]
-        speeds = []
-        for frame, nodes in enumerate(lines):
-            before = lines[max(frame - 1, 0)]
+    def velocity(self, frame: int, period_s: float) -> list[Float[np.ndarray, "_ 3"]]:
+        """Return the velocity of each device's nodes at a frame, mm/s: that of places so far behind its tip."""
+        speeds = [np.zeros_like(nodes) for nodes in self.nodes[frame]]
+        for speed, nodes, before in zip(speeds, self.nodes[frame], self.nodes[max(frame - 1, 0)], strict=True):
             count = min(len(nodes), len(before))
-            speed = np.zeros_like(nodes)
             speed[:count] = (nodes[:count] - before[:count]) / period_s
-            speeds.append(speed)
         return speeds
 
 

@@ -198,7 +198,7 @@ def coco(parts: Iterable[Mapping[str, Any]], about: str) -> dict[str, Any]:
 RECORD_FILE, COCO_FILE = "cine.json", "coco.json"
 """What a cine shows, and its keypoints and masks."""
 TRUTH_FILE, DICOM_FILE = "truth.npz", "cine.dcm"
-_kept: dict[str, XrayImager] = {}
+_kept: dict[tuple[str, Path], XrayImager] = {}
 """The imager of the last patient in this process: cines of one patient follow each other."""
 
 
@@ -226,9 +226,9 @@ def write_cine(layout: Layout, folder: Path) -> None:
     """Make a cine, and write its frames, and what is true of them, into its folder. Raises InputError where no motion
     of the devices can be simulated in the vessel, or for no such policy."""
     name, _, number = folder.name.rpartition("-")
-    imager, patient = _imager(layout, name), layout.names.index(name)
-    draw = draw_cine(layout.config, imager.anatomy, int(number))
-    cine = Cine(layout.config, draw, imager)
+    patient, config = layout.names.index(name), layout.config
+    imager = _imager(layout, patient)
+    cine = Cine(config, draw_cine(config, imager.anatomy, int(number)), imager)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     signals, truths = [], []
@@ -240,11 +240,10 @@ def write_cine(layout: Layout, folder: Path) -> None:
             (partial / "frames" / file).write_bytes(png_image(frame.grey))
             (partial / "masks" / file).write_bytes(png_image(laid_together(frame.masks)))
             path = f"cines/{folder.name}/frames/{file}"
-            cine_number = patient * layout.config.cines + int(number)
-            image, entries = frame_entries(cine, frame, path, index, cine_number)
+            image, entries = frame_entries(cine, frame, path, index, patient * config.cines + int(number))
             images.append(image | {"cine": folder.name, "patient": name})
             annotations += entries
-            signals.append(stored(frame.signal, layout.config.image.window))
+            signals.append(stored(frame.signal, config.image.window))
             truths.append(_truth_of(cine, frame, index))
         xa, identity = np.stack(signals), f"{layout.key} {name}"
         write_xa(partial / DICOM_FILE, cine, xa, number=int(number), identity=identity)
@@ -254,16 +253,13 @@ def write_cine(layout: Layout, folder: Path) -> None:
         write_json(partial / RECORD_FILE, _record(cine, layout, patient, int(number)))
 
 
-def _imager(layout: Layout, name: str) -> XrayImager:
-    key = f"{layout.key} {name}"
-    imager = _kept.get(key)
-    if imager is None:
-        folder = layout.output / "patients" / name
+def _imager(layout: Layout, patient: int) -> XrayImager:
+    folder = layout.patients[patient]
+    if (key := (layout.key, folder)) not in _kept:
         ct = read_volume(folder / CT_FILE) if (folder / CT_FILE).exists() else None
-        imager = XrayImager(read_anatomy(folder), layout.stack, ct=ct, config=layout.config.image)
         _kept.clear()
-        _kept[key] = imager
-    return imager
+        _kept[key] = XrayImager(read_anatomy(folder), layout.stack, ct=ct, config=layout.config.image)
+    return _kept[key]
 
 
 def _truth_of(cine: Cine, frame: CineFrame, number: int) -> dict[str, np.ndarray]:

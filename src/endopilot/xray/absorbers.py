@@ -65,11 +65,9 @@ def surroundings(anatomy: Anatomy) -> Volume | None:
 
 
 def without_contrast(ct: Volume, points: Places) -> Volume:
-    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast.
-
-    So is all blood in chambers and large vessels: what stays contrasted where anything thinner than `_POOL_MM` is
-    opened; bone is denser, or thinner.
-    """
+    """Return a CT, HU, with the blood at the points of the vessel's lumen, LPS mm, as it is without contrast. So is all
+    blood in chambers and large vessels: what stays contrasted where anything thinner than `_POOL_MM` is opened; bone is
+    denser, or thinner."""
     voxels, every = ct.voxels.astype(np.float32), np.maximum((2.0 / ct.spacing_mm[::-1]).astype(int), 1)
     coarse = voxels[:: every[0], :: every[1], :: every[2]]
     size = 2 * (_POOL_MM / 2 / (ct.spacing_mm[::-1] * every)).astype(int) + 1
@@ -87,10 +85,8 @@ def without_contrast(ct: Volume, points: Places) -> Volume:
 
 
 def lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
-    """Return the lumen as small volumes: their places, LPS mm, and sizes, mm³; those on the wall count in part.
-
-    What lies behind the ostium is the catheter, which the distance map holds too; it is left out.
-    """
+    """Return the lumen as small volumes: their places, LPS mm, and sizes, mm³; those on the wall count in part. What
+    lies behind the ostium is the catheter, which the distance map holds too; it is left out."""
     lumen, start = anatomy.distance_map, anatomy.insertion
     share = np.asarray(lumen.values) / lumen.spacing_mm + 0.5
     within = np.flatnonzero(share > 0)
@@ -104,13 +100,8 @@ def lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
 
 
 def catheter_line(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n"], Places, Places]:
-    """Return the axis of the guiding catheter from the ostium backwards.
-
-    It is straight, and that of a coronary artery bends up into the ascending aorta behind its first 10 mm.
-
-    Returns:
-        Distance behind the ostium, mm; places, LPS mm; unit vectors backwards.
-    """
+    """Return the axis of the guiding catheter from the ostium backwards: distance, mm, places, LPS mm, and unit
+    vectors. It is straight, and that of a coronary artery bends up into the ascending aorta behind its first 10 mm."""
     start = anatomy.insertion
     distance, back = np.arange(0.0, _SHOWN_MM, 1.0), -np.asarray(start.direction, dtype=float)
     heading = np.tile(back, (len(distance), 1))
@@ -130,11 +121,11 @@ def in_catheter(
     nodes: Places,
     line: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
 ) -> Places:
-    """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
+    """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend: its axis
+    is `catheter_line`, if it is not given.
 
     The rod core's catheter is straight; nothing that it computes depends on what lies behind. Behind the ostium are the
-    nodes after the last one in front of its plane: vessels pass that plane too, farther on. `line` is the guiding
-    catheter's axis (`catheter_line`), where it is known already.
+    nodes after the last one in front of its plane: vessels pass that plane too, farther on.
     """
     start = anatomy.insertion
     behind = -((nodes - start.position) @ start.direction)
@@ -172,10 +163,8 @@ def across(axis: Places) -> tuple[Places, Places]:
 def wire_points(
     nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1, coil_mm: float = COIL_MM
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Return a wire as small volumes: their places, so far apart, LPS mm, and sizes times their attenuation, mm².
-
-    Its nodes begin at the tip; the radiopaque coil over it is `opaque_tip_mm` long and takes away `coil_mm`, 1/mm.
-    """
+    """Return a wire as small volumes: their places, so far apart, LPS mm, and sizes times their attenuation, mm². Its
+    nodes begin at the tip; the radiopaque coil over it is `opaque_tip_mm` long and takes away `coil_mm`, 1/mm."""
     along = length_along(nodes)
     at = np.arange(step_mm / 2, along[-1], step_mm)
     points = places_on(nodes, along, at)
@@ -186,11 +175,8 @@ def wire_points(
 def driven_catheter_points(
     catheter: Catheter, nodes: Places
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Return a driven catheter as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
-
-    Its wall is that of the guiding catheter's kind. A microcatheter has a ring of platinum in the wall at its tip. The
-    nodes are those of its axis from the tip on.
-    """
+    """Return a driven catheter as small volumes: their places, LPS mm, and sizes times their attenuation, mm². The
+    nodes are those of its axis from the tip on; a microcatheter has a ring of platinum in the wall there."""
     outer, inner = catheter.tip_radius_mm, catheter.inner_diameter_mm / 2
     radius = (outer + inner) / 2
     wall, sizes = _tube(nodes, radius, outer - inner, _STEP_MM, CATHETER_MM)

@@ -15,8 +15,9 @@ from endopilot.simulation.motion import place
 
 Vector = Float[np.ndarray, "3"]
 Places = Float[np.ndarray, "n 3"]
+Affine = Float[np.ndarray, "3 4"]
 Image = Float32[np.ndarray, "rows columns"]
-"""A point or a direction, LPS; some points, LPS mm; and what there is at each pixel: light, attenuation, evidence."""
+"""A point or a direction, LPS; points, LPS mm; a map of points; and what there is at each pixel: light, attenuation."""
 _Distance = Annotated[float, Within(100, 5000, unit="mm", mistaken=(("m", 1000.0), ("cm", 10.0)))]
 
 
@@ -73,7 +74,7 @@ class Pose:
         """Return where points of the CT, LPS mm, lie in the C-arm's frame."""
         return place(self.affine(isocenter), points)
 
-    def affine(self, isocenter: Vector) -> Float[np.ndarray, "3 4"]:
+    def affine(self, isocenter: Vector) -> Affine:
         """Return the map that `move` applies."""
         matrix = Rotation.from_rotvec(self.rotation_rad).as_matrix()
         return np.column_stack([matrix, isocenter + self.translation_mm - matrix @ isocenter])

@@ -82,25 +82,17 @@ class XrayCine:
         return lit
 
     def photons(self) -> float:
-        """Return how many photons a pixel of usual brightness would count to be as noisy as these images.
-
-        Fine structure is noise but for a small share of the pixels; so the median tells its size.
-        """
+        """Return how many photons a pixel of usual brightness would count to be as noisy as these images: fine
+        structure is noise but for a small share of the pixels, so that the median tells its size."""
         middle = self.signals[len(self.signals) // 2]
         fine = np.abs(gaussian_laplace(middle, 1.0)) * np.exp(0.5 * middle)
         return float((0.6745 * _WHITE / max(float(np.median(fine)), 1e-6)) ** 2)
 
 
 def read_cine(paths: tuple[Path, ...] | Path, *, c_arm: Path | None = None) -> XrayCine:
-    """Read the frames of one plane.
-
-    Args:
-        paths: a DICOM file of an X-ray angiographic image, of one frame or more, or PNG images in the order of time.
-        c_arm: YAML file of the C-arm (`CArmCamera`), in place of the tags; needed for PNG.
-
-    Raises:
-        InputError: no such file, or none that can be used; the line names the file, what lacks in it and the mend.
-    """
+    """Read the frames of one plane: a DICOM file of an X-ray angiographic image, of one frame or more, or PNG images in
+    the order of time. A YAML file of the C-arm (`CArmCamera`) takes the place of tags; PNG needs one. Raises
+    InputError, which names the file, what lacks in it and the mend."""
     paths = (paths,) if isinstance(paths, Path) else paths
     path = regular(paths[0])
     camera = None
@@ -145,11 +137,7 @@ def _windowed(values: np.ndarray, centre: float, width: float) -> np.ndarray:
 
 
 def _header(path: Path) -> Any:
-    """Return a DICOM file that holds an X-ray image.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Return a DICOM file that holds an X-ray image; InputError if it does not."""
     import pydicom
     from pydicom.errors import InvalidDicomError
 
@@ -197,11 +185,7 @@ def _light(header: Any, path: Path) -> tuple[Float32[np.ndarray, "frames rows co
 
 
 def _camera(header: Any, path: Path, shape: tuple[int, ...]) -> tuple[CArmCamera, tuple[str, ...]]:
-    """Return the C-arm of a file's tags, about an isocenter at 0.
-
-    Raises:
-        InputError: a tag lacks, or makes no sense.
-    """
+    """Return the C-arm of a file's tags, about an isocenter at 0; InputError for a tag that lacks or makes no sense."""
     found, notes = {}, []
     for name, tag in _TAGS.items():
         value = header.get(name)
@@ -246,11 +230,7 @@ def _upright(header: Any, light: np.ndarray, camera: CArmCamera) -> tuple[np.nda
 
 
 def _times(header: Any, path: Path, count: int) -> tuple[Float[np.ndarray, "frames"], tuple[str, ...]]:
-    """Return the times of the frames, s, and what was assumed.
-
-    Raises:
-        InputError: the file names times of another number of frames.
-    """
+    """Return the times of the frames, s, and what was assumed; InputError for times of another number of frames."""
     if vector := header.get("FrameTimeVector"):
         steps = np.ravel(vector).astype(float)
         if len(steps) != count:

@@ -39,10 +39,8 @@ PARAMETERS = Path(__file__).parent / "ridge.json"
 
 
 def ridge_evidence(signal: Image, photons: float, rough: Image | float = 0.0) -> Image:
-    """Return the logarithm of how much likelier each pixel is on a wire than off it: a logistic regression on ridges.
-
-    Of `features`, whose arguments these are, and the products of any two.
-    """
+    """Return the logarithm of how much likelier each pixel is on a wire than off it: a logistic regression on ridges,
+    the `features`, whose arguments these are, and the products of any two."""
     found, (weight, offset) = features(signal, photons, rough), _trained()
     square = np.zeros((len(found), len(found)), dtype=np.float32)
     square[np.triu_indices(len(found))] = weight[len(found) :] / _MOST
@@ -58,11 +56,9 @@ def _trained() -> tuple[Float[np.ndarray, "terms"], float]:
 
 
 def features(signal: Image, photons: float, rough: Image | float = 0.0) -> Float32[np.ndarray, "f n"]:
-    """Return the features of the flat image's pixels: ridges and darkness over the noise, and that.
-
-    A pixel of usual brightness counts so many photons; `rough` is the standard deviation of the coarsest ridges that
-    are neither wire nor noise, powers of e.
-    """
+    """Return the features of the flat image's pixels: ridges and darkness over the noise, and that. A pixel of usual
+    brightness counts so many photons; `rough` is the standard deviation of the coarsest ridges that are neither wire
+    nor noise, powers of e."""
     smooth = [gaussian_filter(signal, scale, mode="nearest") for scale in SCALES_PX]
     around = _smoother(smooth[-1], SCALES_PX[-1], _BESIDE_PX).ravel()
     noise = np.hypot(np.exp(-0.5 * around) / np.float32(np.sqrt(photons)), np.ravel(rough).astype(np.float32))
@@ -149,10 +145,8 @@ posterior lies within 10 pixels of it."""
 
 
 class Exposure(NamedTuple):
-    """What one exposure shows: its views, images without contrast, evidence of a wire and lines from before.
-
-    And for each shift of the vessel the evidence of a wire to each place, a logarithm.
-    """
+    """What one exposure shows: its views, images without contrast, evidence of a wire and lines from before; and for
+    each shift of the vessel the evidence of a wire to each place, a logarithm."""
 
     views: Sequence[View]
     plain: Sequence[Image]
@@ -186,10 +180,8 @@ class TipDetector:
         lines: Sequence[Line] = (),
         displaced: Float[np.ndarray, "3 3"] | None = None,
     ) -> TipEstimate:
-        """Return where the tip is in the images of one exposure if there is a wire, and how likely that is.
-
-        `inserted_length` is Δ by the robot's encoder, mm; the other arguments are those of `look`.
-        """
+        """Return where the tip is in the images of one exposure if there is a wire, and how likely that is, given Δ by
+        the robot's encoder, mm; the other arguments are those of `look`."""
         seen, ends = self.look(views, signals, photons, lines, displaced), end_log(self.grid.abscissa, inserted_length)
         told, log_odds = self.tell(seen, ends)
         return self.judge(seen, or_folded(self.grid, told, ends, inserted_length), ends, log_odds)
@@ -224,10 +216,8 @@ class TipDetector:
         return Exposure(views, plain, evidence, lines, shifts, way)
 
     def judge(self, seen: Exposure, told: Told, ends: Float[np.ndarray, "places"], log_odds: float) -> TipEstimate:
-        """Return where the tip is, given what `tell` says, and how likely it is at each place before, a logarithm.
-
-        An ambiguous one is as uncertain as the places are far apart; on a line from before the wire may end elsewhere.
-        """
+        """Return where the tip is, given what `tell` says, and how likely it is at each place before, a logarithm. An
+        ambiguous one is as uncertain as the places are far apart; on a line from before the wire may end elsewhere."""
         found = self.grid.estimate(told, ends, _MODE_MM)
         found = refined(found, seen.views, seen.plain, seen.evidence, self._radius_mm)
         found = replace(found, log_odds=log_odds)
@@ -254,10 +244,8 @@ class TipDetector:
         return told, log_odds - max(float(seen.way[catheter][-1].max()) - most, 0.0)
 
     def lines(self, view: View, before: Image, photons: float) -> Line:
-        """Return the pixels near lines of an image without a wire around the vessel, as an exposure would show them.
-
-        Of more `photons` an exposure shows fainter lines.
-        """
+        """Return the pixels near lines of an image without a wire around the vessel, as an exposure of so many photons
+        would show them; more show fainter ones."""
         box, near = _box_around(view, self._vessel, len(before), _AROUND_MM), np.zeros(before.shape, dtype=bool)
         line = self._saturated(ridge_evidence(before[box], photons)) > _LINE
         parts: Any = connected_parts(line, np.ones((3, 3)))
@@ -297,10 +285,8 @@ class TipDetector:
 
 
 def own_share(dark: Float[np.ndarray, "*n"], photons: float) -> Float[np.ndarray, "*n"]:
-    """Return the share of what is seen that no neighbour has told, given by how much contrast darkens each pixel.
-
-    Noise differs from mm to mm; a ridge of contrast that the CT lacks goes on, and says the same again and again.
-    """
+    """Return the share of what is seen that no neighbour has told, given by how much contrast darkens each pixel: noise
+    differs from mm to mm; a ridge of contrast that the CT lacks goes on, and says the same again and again."""
     ridges = photons * (_SHAPE * np.where(np.isfinite(dark), dark, 0)) ** 2
     return np.isfinite(dark) * (1 + ridges) / (1 + _ALONG_MM * ridges)
 

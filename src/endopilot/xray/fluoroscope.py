@@ -122,10 +122,8 @@ class CArm:
     def _measured(
         self, places: Places, covariances: Float[np.ndarray, "n 3 3"], weight: Float[np.ndarray, "n"] | None = None
     ) -> TipMeasurement:
-        """Return the measurement of a tip at one of some places, LPS mm, the likeliest first.
-
-        It has a covariance around each place, if it is there, mm²; each is as likely as its weight says, or equally.
-        """
+        """Return the measurement of a tip at one of some places, LPS mm, the likeliest first, with the covariance
+        around each, if it is there, mm²; each is as likely as its weight says, or equally."""
         share = np.full(len(places), 1.0 / len(places)) if weight is None else weight / weight.sum()
         tips, insertion = self._project(places), self._anatomy.insertion
         branch, abscissa = int(tips.branch[0]), float(tips.abscissa[0])
@@ -145,21 +143,16 @@ class CArm:
         return TipMeasurement(places[0], abscissa, float(tips.offset[0]), branch, covariance, (along, out), around)
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
-        """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
-
-        Raises:
-            InputError: exposures cannot show it: what is assumed of errors says nothing of contrast.
-        """
+        """Inject contrast and return how the patient moves by a run of images, None where that is nothing known;
+        InputError where exposures cannot show it: what is assumed of errors says nothing of contrast."""
         raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
 
 
 def seen(
     placed: Float[np.ndarray, "n 3 4"], known: CoreMotion | None, times_s: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 3 4"]:
-    """Return the affine maps by which the C-arm sees points of the moving vessel displaced, mm in the vessel of the CT.
-
-    The vessel is truly placed so at these times, s; the C-arm takes the known motion off.
-    """
+    """Return the affine maps by which the C-arm sees points of the moving vessel displaced, mm in the vessel of the CT:
+    truly placed so at these times, s, of which it takes the known motion off."""
     return placed if known is None else relative(placed, known.placements(times_s)[0])
 
 
@@ -352,11 +345,8 @@ class TipFinder:
         whiten: Float[np.ndarray, "n views 2 2"],
     ) -> tuple[Places, Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3 3"]]:
         """Return the likeliest places near vertices, twice their negative log-likelihoods, the vertices nearest to them
-        and the inverses of their covariances.
-
-        Gauss-Newton on the errors of the pixels, in units of the detection's error, and on the distance from the line,
-        in units of what is usual in that lumen.
-        """
+        and the inverses of their covariances: Gauss-Newton on the errors of the pixels, in units of the detection's
+        error, and on the distance from the line, in units of what is usual in that lumen."""
         first, last, nearest = self._first[arm, nearest], self._last[arm, nearest], nearest.copy()
         place, cost, going = self._points[arm, nearest], np.zeros(len(arm)), np.arange(len(arm))
         information = np.zeros((len(arm), 3, 3))
@@ -418,13 +408,9 @@ def make_c_arm(
     seed: int = 0,
     registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> CArm:
-    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
-
-    The seed is that of the pose in which a patient lies whose images are taken, and of these images' noise.
-
-    Raises:
-        InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
-    """
+    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says. The seed is that of the pose
+    in which a patient lies whose images are taken, and of these images' noise. Raises InputError for images of a wire
+    in a catheter, or of a vessel that is not recognised in them."""
     device = navigation.device
     how: Any = {"config": config, "known_motion": navigation.known_motion, "registration_mm": registration_mm}
     if navigation.xray == "assumed":

@@ -37,7 +37,7 @@ from endopilot.xray.absorbers import (
     wire_points,
     without_contrast,
 )
-from endopilot.xray.carm import CArmGeometry, Image, Places, Pose, Vector, View, view_at, view_of
+from endopilot.xray.carm import Affine, CArmGeometry, Image, Places, Pose, Vector, View, view_at, view_of
 from endopilot.xray.projector import Shadow, blurred, cast
 
 PHOTONS_MM2_UGY = 30174.0
@@ -120,7 +120,7 @@ class Plane:
     scatter: Image
     vessel_mm: Image
     reference: float
-    placed: Float[np.ndarray, "3 4"]
+    placed: Affine
 
     def pixel(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Return row and column of points of the vessel or in it, LPS mm of the CT."""
@@ -179,7 +179,7 @@ class XrayImager:
         *,
         rays: int = 256,
         pose: Pose | None = None,
-        placed: Float[np.ndarray, "3 4"] | None = None,
+        placed: Affine | None = None,
     ) -> Plane:
         """Compute what does not move under some angles.
 
@@ -197,7 +197,7 @@ class XrayImager:
             view = view_of(view, pose, self.isocenter)
         return self.plane_through(self.patient(view, rays=rays), view, zoom_factor, placed)
 
-    def plane_through(self, patient: Image, view: View, zoom_factor: float, placed: Float[np.ndarray, "3 4"]) -> Plane:
+    def plane_through(self, patient: Image, view: View, zoom_factor: float, placed: Affine) -> Plane:
         """Compute what does not move, as `plane` does, given the attenuation of the patient in a view of the CT."""
         background = patient + self.cloud("guide", view, zoom_factor, placed)
         vessel = self.cloud("lumen", view, zoom_factor, placed)
@@ -217,11 +217,7 @@ class XrayImager:
         return np.asarray(wide, dtype=np.float32)
 
     def cloud(
-        self,
-        part: Literal["guide", "lumen", "guide lumen"],
-        view: View,
-        zoom_factor: float,
-        placed: Float[np.ndarray, "3 4"],
+        self, part: Literal["guide", "lumen", "guide lumen"], view: View, zoom_factor: float, placed: Affine
     ) -> Image:
         """Return the attenuation of the guiding catheter's wall along each ray, or the ray's path through the vessel's
         lumen or inside the guiding catheter, mm; other arguments as `plane_through` has."""

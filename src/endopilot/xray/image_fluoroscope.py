@@ -51,13 +51,10 @@ class ImageFluoroscope(CArm):
         known_motion: Motion | None = None,
         registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Lay the patient on the table, inject contrast and register.
+        """Lay the patient on the table, inject contrast and register; NotRegistered if that fails.
 
         A coronary artery lies in a synthetic chest, any other vessel in water. The seed draws the pose, up to 5 mm and
         3° along and about each axis, and these images' noise; the errors of detection of `config` are not used.
-
-        Raises:
-            NotRegistered: the vessel is not recognised in the images.
         """
         super().__init__(anatomy, known_motion, registration_mm)
         config, random = config or FluoroscopeConfig(), np.random.default_rng([seed, 0x706F7365])
@@ -83,11 +80,8 @@ class ImageFluoroscope(CArm):
         self.shift, self.spread = np.zeros(3), self.registration.place_covariance(self._anatomy) + off
 
     def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
-        """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
-
-        Raises:
-            NotRegistered: the vessel is not recognised in the images.
-        """
+        """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them;
+        NotRegistered if the vessel is not recognised there."""
         if motion is None or (mean := published_mean(motion)) is None:
             return None
         run = take_run(self._imager, self._angles_deg, self.pose, motion, random)
@@ -103,11 +97,9 @@ class ImageFluoroscope(CArm):
         return self.measure(nodes, inserted_length, random)
 
     def measure(self, nodes: Places, inserted_length: float, random: np.random.Generator) -> TipMeasurement | None:
-        """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be.
-
-        None where no wire is found. One whose tip is not ambiguous refines the pose that later exposures take the
-        patient to lie in.
-        """
+        """Take one exposure of every view and say where the tip of a wire with these nodes, LPS mm, is found to be,
+        None where no wire is. One whose tip is not ambiguous refines the pose that later exposures take the patient to
+        lie in."""
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         views = [replace(view, source=view.source - self.shift) for view in self._registered]
         found = self._detector.estimate(views, signals, self._photons, inserted_length, self._lines, self.spread)

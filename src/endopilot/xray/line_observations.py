@@ -91,11 +91,12 @@ def shown_by(camera: Camera | View, points: Places) -> tuple[Float[np.ndarray, "
 
 
 def smooth_line(line: Line, width: float) -> tuple[Line, float, float]:
-    """Return a line blurred along itself, its ends kept, its roughness and what is left of it, pixels.
+    """Return a line blurred along itself, its ends kept, by a Gaussian of this standard deviation, its roughness and
+    what is left of it, pixels.
 
     A rough line is longer than it should be, so that the blur is too narrow: each round measures the length anew, on
     what the round before has blurred. What the blur takes from bends, a second one of the difference gives back
-    (twicing: Tukey, Exploratory Data Analysis, 1977). The width is the Gaussian's standard deviation, pixels.
+    (twicing: Tukey, Exploratory Data Analysis, 1977).
     """
     if len(line) < 3:
         return line, 0.0, 0.0
@@ -140,14 +141,8 @@ def see(grid: VesselGrid, camera: Camera | View, line: Line, way: Places) -> See
 def observe(
     grid: VesselGrid, seen: SeenLine, places: Int[np.ndarray, "m"], moved: Float[np.ndarray, "m k 3"] | None
 ) -> tuple[Observations, Int[np.ndarray, "m"]]:
-    """Return what a line's end says, in both directions, and its points and length, and how many lie before the root.
-
-    Args:
-        grid: the places.
-        seen: the line.
-        places: of its tip.
-        moved: how far the way is moved at each point, as found so far, mm; None for the end alone.
-    """
+    """Return what a line's end says of places of its tip, in both directions, and its points and length; and how many
+    points lie before the root. The way is moved so far at each, mm, as found so far; None is for the end alone."""
     scale = seen.scale[places, None]
     end = Observations(
         place=np.repeat(places[:, None], 2, axis=1),

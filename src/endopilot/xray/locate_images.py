@@ -88,17 +88,9 @@ class ImagesLocated:
 def locate_in_images(
     anatomy: Anatomy, *, cines: Sequence[XrayCine], device: Wire, config: LocateConfig | None = None
 ) -> ImagesLocated:
-    """Find the tip of a wire in each frame of a cine, or of two planes that were exposed together.
-
-    Args:
-        anatomy: the vessel.
-        cines: one plane or two.
-        device: the wire.
-        config: a landmark, where no contrast registers the patient, and how far the tip travels.
-
-    Raises:
-        InputError: planes of different numbers of frames, or nothing that registers the patient.
-    """
+    """Find the tip of a wire in each frame of a cine, or of two planes that were exposed together; `config` has a
+    landmark, where no contrast registers the patient, and how far the tip travels. Raises InputError for planes of
+    different numbers of frames, or where nothing registers the patient."""
     config, count = config or LocateConfig(), len(cines[0].times_s)
     for one in cines[1:]:
         if len(one.times_s) != count:
@@ -148,10 +140,7 @@ def _registered(
     anatomy: Anatomy, cines: tuple[XrayCine, ...], config: LocateConfig
 ) -> tuple[tuple[XrayCine, ...], _Laid, dict[int, Registration], int, tuple[str, ...]]:
     """Return the cines as they fit the vessel, how it lies in each frame, frames that show it, the best one, and notes.
-
-    Raises:
-        InputError: nothing registers the patient.
-    """
+    Raises InputError where nothing registers the patient."""
     notes = tuple(f"{one.path.name}: {note}" for one in cines for note in one.notes)
     count, isocenter = len(cines[0].times_s), isocenter_of(anatomy)
     if config.landmark_mm is not None:
@@ -206,9 +195,7 @@ def _darkened(
     shown: Float32[np.ndarray, "frames rows rows"], empty: Image, field: Bool[np.ndarray, "rows rows"]
 ) -> list[Image]:
     """Return how much darker than without contrast the surroundings of each pixel are: a wire darkens them little.
-
-    Where nothing is seen anything may be, contrast without bound.
-    """
+    Where nothing is seen anything may be, contrast without bound."""
     dark = [gaussian_filter(empty - one, _SURROUNDINGS_PX) for one in shown]
     return [np.where(field, np.maximum(one - np.median(one[field]), 0), np.float32(np.inf)) for one in dark]
 

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.types import Volume
 from endopilot.xray.absorbers import WATER_MM
-from endopilot.xray.carm import Image, Places, View
+from endopilot.xray.carm import Affine, Image, Places, View
 
 _RAY_STEP_MM = 1.5
 _COARSE_MM, _COARSE_RAYS, _SIDES_MM = 8.0, 64, 15.0
@@ -37,11 +37,9 @@ def cast(ct: Volume, view: View, pixels: int, rays: int) -> Float32[np.ndarray, 
 
 
 def _beyond(ct: Volume) -> Volume:
-    """Return the body around a CT, HU, with air where the CT is.
-
-    The body goes on as the CT's sides do on average, as far as a chest reaches, and to head and feet without end. So a
-    CT that holds the body whole, with air at its sides, has none around.
-    """
+    """Return the body around a CT, HU, with air where the CT is. It goes on as the CT's sides do on average, as far as
+    a chest reaches, and to head and feet without end: around a CT that holds it whole, with air at its sides, is
+    none."""
     size = np.array(ct.voxels.shape[::-1])
     count = np.maximum(np.rint(size * ct.spacing_mm / _COARSE_MM), 2).astype(int)
     index = np.stack(np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip(size, count, strict=True)), indexing="ij"))
@@ -81,9 +79,7 @@ def _march(ct: Volume, view: View, pixels: int, rays: int, step_mm: float) -> Fl
 
 def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray, "3 n"]) -> Float32[np.ndarray, "n"]:
     """Return values between voxels, linearly, and beyond their sides those at the edge; `index` is along x, y and z.
-
-    SciPy's `map_coordinates` does the same in more than three times the time.
-    """
+    SciPy's `map_coordinates` does the same in more than three times the time."""
     last = np.array(voxels.shape[::-1])[:, None] - 1
     index = np.clip(index, 0, last, dtype=np.float32)
     low = np.minimum(index.astype(np.intp), np.maximum(last - 1, 0))
@@ -103,7 +99,7 @@ def _between(voxels: Float32[np.ndarray, "nz ny nx"], index: Float32[np.ndarray,
 class Shadow:
     """Where small volumes fall on the detector, and line integrals of several quantities of them."""
 
-    def __init__(self, view: View, pixels: int, points: Places, placed: Float[np.ndarray, "3 4"] | None = None) -> None:
+    def __init__(self, view: View, pixels: int, points: Places, placed: Affine | None = None) -> None:
         """Project volumes at some points, LPS mm, after an affine map, if one is given, onto an image of so many pixels
         along a side."""
         onto = np.eye(3, 4) if placed is None else placed.copy()

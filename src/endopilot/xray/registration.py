@@ -168,10 +168,8 @@ def take_run(
 
 
 def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Images, config: ImageConfig) -> Pose:
-    """Return the shift, up to half an image, in which the vessel fits the images best.
-
-    It begins a registration where nobody says how far the vessel lies from the isocenter; arguments as `register` has.
-    """
+    """Return the shift, up to half an image, in which the vessel fits the images best, with which a registration begins
+    where nobody says how far the vessel lies from the isocenter; arguments as `register` has."""
     averaged, blur = _LEVELS[0]
     observed = observed_contrast(contrasted, before, averaged, blur, config)
     points, size, _ = sampled_lumen(anatomy)
@@ -191,10 +189,8 @@ def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Ima
 
 
 class _Sought(NamedTuple):
-    """Numbers that are sought, laid so with these standard deviations before any image, and the maps that they make.
-
-    The maps are affine, of the CT's points at each moment, LPS mm.
-    """
+    """Numbers that are sought, laid so with these standard deviations before any image, and the affine maps of the CT's
+    points, LPS mm, that they make at each moment."""
 
     maps: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "moments 3 4"]]
     laid: Float[np.ndarray, "k"]
@@ -234,10 +230,8 @@ def _fit(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """The comparison of the projected lumen with what contrast added to each image at each moment, averaged, blurred.
-
-    `averaged` pixels along a side are one, and the blur is in these.
-    """
+    """The comparison of the projected lumen with what contrast added to each image at each moment: `averaged` pixels
+    along a side are one, and the blur is in these."""
 
     sought: _Sought
     lumen: _Lumen

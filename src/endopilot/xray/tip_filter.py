@@ -114,11 +114,9 @@ def located(tree: VesselTree, frame: int, found: TipEstimate, place: tuple[int, 
 
 
 class _Fit(NamedTuple):
-    """What observations say of some places of the tip: their logarithm, and the pose with its covariance.
-
-    And how far the vessel is moved at each observation beyond the mean pose, mm, and how far the device lies aside of
-    its way at the first one, mm, with its covariance, mm².
-    """
+    """What observations say of some places of the tip: their logarithm, and the pose with its covariance; how far the
+    vessel is moved at each observation beyond the mean pose, mm, and how far the device lies aside of its way at the
+    first one, mm, with its covariance, mm²."""
 
     log_density: Float[np.ndarray, "m"]
     mean: Float[np.ndarray, "m 6"]
@@ -129,10 +127,8 @@ class _Fit(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """A frame's number, what its lines say of some places, and with the frames before, the lines' residuals, mm.
-
-    And how far the vessel lies there from where the cameras have the CT, LPS mm.
-    """
+    """A frame's number, what its lines say of some places, and with the frames before, the lines' residuals, mm; and
+    how far the vessel lies there from where the cameras have the CT, LPS mm."""
 
     frame: int
     told: Told
@@ -209,11 +205,9 @@ class TipFilter:
         return self._answer(self._seen[-1], before)
 
     def smooth(self) -> dict[int, TipLocation]:
-        """Return where the tip is in each frame that shows it, by all frames, those after too.
-
-        One view of a patient whom the device alone registers shows travel and shift alike: what later frames say of the
-        tip's place is what they say of the pose, and tells nothing more. None is returned then.
-        """
+        """Return where the tip is in each frame that shows it, by all frames, those after too. None is returned where
+        one view of a patient whom the device alone registers shows travel and shift alike: what later frames say of the
+        tip's place is what they say of the pose, and tells nothing more."""
         if self._registers_itself:
             return {}
         frames = np.diff(np.array([one.frame for one in self._seen], dtype=float))
@@ -257,10 +251,8 @@ class TipFilter:
     def _compare(
         self, seen: Sequence[SeenLine], places: Int[np.ndarray, "m"], base: Float[np.ndarray, "6"], *, rounds: int
     ) -> tuple[_Fit, Observations, Int[np.ndarray, "m"]]:
-        """Return what lines say of some places of the tip, and how many of their points lie before the root.
-
-        At first the ends alone are compared; then, so many times, the points with the way as it is moved by then.
-        """
+        """Return what lines say of some places of the tip, and how many of their points lie before the root. At first
+        the ends alone are compared; then, so many times, the points with the way as it is moved by then."""
         parts = [observe(self.grid, one, places, None) for one in seen]
         rows = joined([part for part, _ in parts])
         fit = self._fit(places, rows, base)

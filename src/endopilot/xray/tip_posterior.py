@@ -188,10 +188,8 @@ class VesselGrid:
         return np.split(np.arange(len(self.branch)), np.flatnonzero(np.diff(self.branch)) + 1)
 
     def straightened(self, stiff_mm: float) -> Float[np.ndarray, "n 3"]:
-        """Return where a device passes that is too stiff to follow each bend, LPS mm: the centerline, blurred.
-
-        Along the longest path through each place, its ends kept, by a Gaussian of this standard deviation, mm.
-        """
+        """Return where a device passes that is too stiff to follow each bend, LPS mm: the centerline, blurred along the
+        longest path through each place, its ends kept, by a Gaussian of this standard deviation, mm."""
         leaf = np.arange(len(self.middle))
         for place in range(len(leaf) - 1, 0, -1):
             before = self.parent[place]
@@ -213,10 +211,8 @@ class VesselGrid:
     def told_by_later(
         self, config: LocateConfig, told: Sequence[Told], frames: Float[np.ndarray, "steps"]
     ) -> list[Float[np.ndarray, "_"]]:
-        """Return what all later times say of each one's places, a logarithm, as each is told by itself.
-
-        `frames` is how many frames lie between each and the next. In reverse order it is what all earlier ones say.
-        """
+        """Return what all later times say of each one's places, a logarithm, as each is told by itself, and so many
+        frames lie between each and the next. In reverse order it is what all earlier ones say."""
         said = [np.zeros(len(told[-1].places))] if len(told) else []
         for k in range(len(told) - 1, 0, -1):
             log = told[k].log + said[-1]

@@ -55,10 +55,8 @@ def fit_end(
     signal: Image, guess: Float[np.ndarray, "2"], forwards: Float[np.ndarray, "2"], width_px: float
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]] | None:
     """Return where a dark line ends, and its covariance, pixels²; None if no line ends there, or the image does.
-
     `guess` is where the end should be, to the right of the image's middle and up from it, pixels, as is what is
-    returned; `forwards` leads along the line to its end; `width_px` is the standard deviation of its profile.
-    """
+    returned; `forwards` leads along the line to its end; `width_px` is the standard deviation of its profile."""
     middle = (len(signal) - 1) / 2
     column, row = np.rint([middle + guess[0], middle - guess[1]]).astype(int)
     if min(row, column) < _RADIUS_PX or max(row, column) >= len(signal) - _RADIUS_PX:
@@ -141,11 +139,9 @@ def refined(
 def _ends(
     image: Image, guess: Float[np.ndarray, "2"], axes: Float[np.ndarray, "2 2"], expected: Float[np.ndarray, "2 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance.
-
-    Unit vectors, along the wire and across it, are the axes, also of what is expected: the end's covariance about the
-    guess, pixels².
-    """
+    """Return how far along and aside a wire ends from a guess, by the evidence of an image, and its covariance. Unit
+    vectors, along the wire and across it, are the axes, also of the end's covariance about the guess that is expected,
+    pixels²."""
     reach, sides = np.ceil(2.5 * np.sqrt(np.diag(expected)))
     along, across = np.arange(-reach - _LEAD_PX, reach + 1), np.arange(-sides, sides + 1)
     right, up = guess[:, None, None] + axes[0][:, None, None] * along[:, None] + axes[1][:, None, None] * across

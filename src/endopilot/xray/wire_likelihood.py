@@ -131,11 +131,8 @@ def tell(
     shifts: Shifts,
     prior: Float[np.ndarray, "n"],
 ) -> tuple[Told, float]:
-    """Return what the evidence of wires to each place, for each shift of the vessel, says of the tip.
-
-    And the logarithm of how much likelier it is with a wire than without. The prior is of each place, a logarithm, from
-    -inf to 0; together, how much likelier there is a wire than none.
-    """
+    """Return what the evidence of wires to each place, for each shift of the vessel, says of the tip, and the logarithm
+    of how much likelier it is with a wire than without. The prior is of each place, a logarithm, from -inf to 0."""
     prior = prior - logsumexp(prior)
     by_shift = logsumexp(way + prior[:, None], axis=0)
     log_odds = float(logsumexp(shifts.log + by_shift))
