@@ -94,8 +94,7 @@ def read_cine(paths: tuple[Path, ...] | Path, *, c_arm: Path | None = None) -> X
     the order of time. A YAML file of the C-arm (`CArmCamera`) takes the place of tags; PNG needs one. Raises
     InputError, which names the file, what lacks in it and the mend."""
     paths = (paths,) if isinstance(paths, Path) else paths
-    path = regular(paths[0])
-    camera = None
+    path, camera, notes = regular(paths[0]), None, list[str]()
     if c_arm is not None:
         given = read_camera(c_arm)
         if not isinstance(given, CArmCamera):
@@ -105,18 +104,18 @@ def read_cine(paths: tuple[Path, ...] | Path, *, c_arm: Path | None = None) -> X
         if camera is None:
             raise InputError(f"{path}: a PNG says nothing of the C-arm; give its file, --camera c-arm.yaml")
         light = np.stack([_png(one) for one in paths])
-        times_s, notes = np.arange(len(paths)) * 1.0, ("PNG images are taken to be 1 s apart",)
+        times_s = np.arange(len(paths)) * 1.0
+        notes.append("PNG images are taken to be 1 s apart")
     else:
         if len(paths) > 1:
             raise InputError(f"{paths[1]}: is a second file of one plane; give one DICOM file for each plane")
         header = _header(path)
-        light, notes = _light(header, path)
-        camera, more = _camera(header, path, light.shape) if camera is None else (camera, ())
-        light, flipped = _upright(header, light, camera)
-        times_s, timing = _times(header, path, len(light))
-        notes = (*notes, *more, *flipped, *timing)
-    light, camera, square = _squared(light, camera)
-    return XrayCine(path, light - np.float32(np.median(light)), times_s, camera, (*notes, *square))
+        light = _light(header, path, notes)
+        camera = camera or _camera(header, path, light.shape, notes)
+        light = _upright(header, light, camera, notes)
+        times_s = _times(header, path, len(light), notes)
+    light, camera = _squared(light, camera, notes)
+    return XrayCine(path, light - np.float32(np.median(light)), times_s, camera, tuple(notes))
 
 
 def _png(path: Path) -> Image:
@@ -157,8 +156,8 @@ def _header(path: Path) -> Any:
     return header
 
 
-def _light(header: Any, path: Path) -> tuple[Float32[np.ndarray, "frames rows columns"], tuple[str, ...]]:
-    """Return the logarithm of the light of all frames by the rule of this module, and what was assumed."""
+def _light(header: Any, path: Path, notes: list[str]) -> Float32[np.ndarray, "frames rows columns"]:
+    """Return the logarithm of the light of all frames by the rule of this module, and note what was assumed."""
     try:
         values = header.pixel_array
     except Exception:  # compressions that pydicom alone does not know; GDCM does
@@ -175,18 +174,17 @@ def _light(header: Any, path: Path) -> tuple[Float32[np.ndarray, "frames rows co
     relationship = header.get("PixelIntensityRelationship") or "DISP"
     if relationship == "LIN":
         values = np.log(np.maximum(values, _DARKEST * np.median(values[values > 0])))
-        return (-values if header.get("PixelIntensityRelationshipSign") == -1 else values), ()
+        return -values if header.get("PixelIntensityRelationshipSign") == -1 else values
     bits = float(2 ** header.get("BitsStored", 8) - 1)
-    centre, width = (np.ravel(header.get(name) or default)[0] for name, default in
-                     (("WindowCenter", bits / 2), ("WindowWidth", bits)))  # fmt: skip
-    light = _windowed(values, float(centre), float(width))
-    note = f"values are taken for the logarithm of the light ({relationship}): the window spans 1.8 powers of e"
-    return (-light if header.get("PhotometricInterpretation") == "MONOCHROME1" else light), (note,)
+    window = header.get("WindowCenter") or bits / 2, header.get("WindowWidth") or bits
+    light = _windowed(values, *(float(np.ravel(each)[0]) for each in window))
+    notes.append(f"values are taken for the logarithm of the light ({relationship}): the window spans 1.8 powers of e")
+    return -light if header.get("PhotometricInterpretation") == "MONOCHROME1" else light
 
 
-def _camera(header: Any, path: Path, shape: tuple[int, ...]) -> tuple[CArmCamera, tuple[str, ...]]:
+def _camera(header: Any, path: Path, shape: tuple[int, ...], notes: list[str]) -> CArmCamera:
     """Return the C-arm of a file's tags, about an isocenter at 0; InputError for a tag that lacks or makes no sense."""
-    found, notes = {}, []
+    found = {}
     for name, tag in _TAGS.items():
         value = header.get(name)
         if value is None or value == "":
@@ -207,59 +205,51 @@ def _camera(header: Any, path: Path, shape: tuple[int, ...]) -> tuple[CArmCamera
     except ValueError as error:
         raise InputError(f"{path}: {str(error).splitlines()[0]}") from error
     middle = ((shape[2] - 1) / 2, (shape[1] - 1) / 2)
-    return CArmCamera(
-        angles_deg=(first, second), isocenter_mm=(0.0, 0.0, 0.0), centre_px=middle, geometry=geometry
-    ), tuple(notes)
+    return CArmCamera(angles_deg=(first, second), isocenter_mm=(0.0, 0.0, 0.0), centre_px=middle, geometry=geometry)
 
 
-def _upright(header: Any, light: np.ndarray, camera: CArmCamera) -> tuple[np.ndarray, tuple[str, ...]]:
+def _upright(header: Any, light: np.ndarray, camera: CArmCamera, notes: list[str]) -> np.ndarray:
     """Return frames as the C-arm sees them, from the source's side: PatientOrientation says if they are mirrored."""
-    towards = {"L": (0, 1), "R": (0, -1), "P": (1, 1), "A": (1, -1), "H": (2, 1), "F": (2, -1)}
-    notes = []
-    for word, axis, image_axis, name in zip(
-        header.get("PatientOrientation") or (), (0, 1), (2, 1), ("left to right", "top to bottom"), strict=False
-    ):
-        if not word or word[0] not in towards:
-            continue
-        part, sign = towards[word[0]]
-        along = camera.view.axes[axis][part] * (1 if axis == 0 else -1)
-        if sign * along < -0.1:
+    right, up, _ = camera.view.axes
+    sides = (right, 2, "left to right"), (-up, 1, "top to bottom")
+    for word, (along, image_axis, name) in zip(header.get("PatientOrientation") or (), sides, strict=False):
+        letter = "LRPAHF".find((word or "?")[0])
+        if letter >= 0 and (-1) ** letter * along[letter // 2] < -0.1:
             light = np.flip(light, image_axis)
             notes.append(f"PatientOrientation (0020,0020) says that the image is mirrored {name}; it was turned back")
-    return light, tuple(notes)
+    return light
 
 
-def _times(header: Any, path: Path, count: int) -> tuple[Float[np.ndarray, "frames"], tuple[str, ...]]:
-    """Return the times of the frames, s, and what was assumed; InputError for times of another number of frames."""
+def _times(header: Any, path: Path, count: int, notes: list[str]) -> Float[np.ndarray, "frames"]:
+    """Return the times of the frames, s; InputError for times of another number of frames."""
     if vector := header.get("FrameTimeVector"):
         steps = np.ravel(vector).astype(float)
         if len(steps) != count:
             raise InputError(
                 f"{path}: FrameTimeVector (0018,1065): {len(steps)} times of {count} frames; mend the file"
             )
-        return np.cumsum(steps) / 1000, ()
+        return np.cumsum(steps) / 1000
     if step := header.get("FrameTime"):
-        return np.arange(count) * float(step) / 1000, ()
+        return np.arange(count) * float(step) / 1000
     for name in ("CineRate", "RecommendedDisplayFrameRate"):
         if rate := header.get(name):
-            return np.arange(count) / float(rate), (f"FrameTime (0018,1063) is not there; by {name}: {rate} a second",)
-    lacks = () if count == 1 else ("FrameTime (0018,1063) is not there; 15 frames a second are assumed",)
-    return np.arange(count) / 15.0, lacks
+            notes.append(f"FrameTime (0018,1063) is not there; by {name}: {rate} a second")
+            return np.arange(count) / float(rate)
+    if count > 1:
+        notes.append("FrameTime (0018,1063) is not there; 15 frames a second are assumed")
+    return np.arange(count) / 15.0
 
 
-def _squared(light: np.ndarray, camera: CArmCamera) -> tuple[np.ndarray, CArmCamera, tuple[str, ...]]:
+def _squared(light: np.ndarray, camera: CArmCamera, notes: list[str]) -> tuple[np.ndarray, CArmCamera]:
     """Return frames padded so that they are square about the middle of the beam."""
     rows, columns = light.shape[1:]
-    column, row = (columns - 1) / 2, (rows - 1) / 2
-    if camera.centre_px is not None:
-        column, row = camera.centre_px
+    column, row = camera.centre_px or ((columns - 1) / 2, (rows - 1) / 2)
     side = int(np.ceil(2 * max(column, row, columns - 1 - column, rows - 1 - row))) + 1
     before = round((side - 1) / 2 - row), round((side - 1) / 2 - column)
     around = [(0, 0), (before[0], side - rows - before[0]), (before[1], side - columns - before[1])]
-    centre = ((side - 1) / 2, (side - 1) / 2)
     if camera.centre_px is not None:
-        camera = replace(camera, centre_px=centre)
+        camera = replace(camera, centre_px=((side - 1) / 2, (side - 1) / 2))
     if side == rows == columns:
-        return light, camera, ()
-    note = f"{columns} × {rows} pixels were padded to {side} × {side} about the middle of the beam"
-    return np.pad(light, around, mode="edge"), camera, (note,)
+        return light, camera
+    notes.append(f"{columns} × {rows} pixels were padded to {side} × {side} about the middle of the beam")
+    return np.pad(light, around, mode="edge"), camera

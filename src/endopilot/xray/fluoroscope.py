@@ -9,9 +9,8 @@ view. docs/concepts/exposure.md says where the numbers come from.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -83,15 +82,12 @@ class CArm:
         registration_mm: the wire shows displaced by this, LPS mm.
     """
 
-    def __init__(
-        self,
-        anatomy: Anatomy,
-        known_motion: Motion | None = None,
-        registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
+    known_motion: Motion | None = None
+    registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __init__(self, anatomy: Anatomy) -> None:
         """Take the patient."""
-        self._anatomy, self.known_motion, self.registration_mm = anatomy, known_motion, registration_mm
-        self._project = TipProjector(anatomy.tree, anatomy.insertion)
+        self._anatomy, self._project = anatomy, TipProjector(anatomy.tree, anatomy.insertion)
 
     def expose(
         self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
@@ -203,7 +199,8 @@ class Fluoroscope(CArm):
         registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Bring the middle of the vessel to the isocenter; `wire_radius_mm` is the tip's, the rest as `CArm` says."""
-        super().__init__(anatomy, known_motion, registration_mm)
+        super().__init__(anatomy)
+        self.known_motion, self.registration_mm = known_motion, registration_mm
         self._config = config or FluoroscopeConfig()
         self._finder = TipFinder([(anatomy, wire_radius_mm)], self._config)
 
@@ -261,27 +258,20 @@ class TipFinder:
         patient; shorter rows end in vertices of no branch. `views` has those of each C-arm."""
         made = [_lines(anatomy, radius_mm, config) for anatomy, radius_mm in patients]
         self._config, self.views = config, [views for views, _ in made]
-        lengths = [[len(line) for line in lines[0]] for _, lines in made]
-        count = max(map(sum, lengths))
+        count = max(len(of["points"]) for _, of in made)
 
-        def table(rows: Iterable[Sequence[np.ndarray]], fill: float | int) -> np.ndarray:
-            joined = [np.concatenate(list(row)) for row in rows]
-            return np.stack([np.pad(a, [(0, count - len(a)), (0, 0)][: a.ndim], constant_values=fill) for a in joined])
+        def table(name: str, fill: float | int) -> np.ndarray:
+            rows = [of[name] for _, of in made]
+            around = [[(0, count - len(row)), *[(0, 0)] * (row.ndim - 1)] for row in rows]
+            return np.stack([np.pad(a, width, constant_values=fill) for a, width in zip(rows, around, strict=True)])
 
-        fills = (0.0, 0.0, 1.0, np.inf)
-        self._points, self._tangents, self._sd, self._abscissa = (
-            table([lines[k] for _, lines in made], fill) for k, fill in enumerate(fills)
-        )
-        self._first = table([[np.repeat(np.cumsum(of) - of, of)] for of in lengths], count)
-        self._last = table([[np.repeat(np.cumsum(of) - 1, of)] for of in lengths], count)
-        self._window = np.arange(max(map(max, lengths)))
+        self._points, self._tangents, shown = (table(name, 0.0) for name in ("points", "tangents", "shown"))
+        self._sd, self._abscissa = table("sd", 1.0), table("abscissa", np.inf)
+        self._first, self._last = table("first", count), table("last", count)
+        self._window = np.arange((self._last - self._first).max() + 1)
         self._begins = np.diff(self._first, axis=1, prepend=-1) != 0
         self._by_axis = np.moveaxis(self._points, -1, 0).copy()
-        shown = [
-            table([[views[k].project(line) for line in lines[0]] for views, lines in made], 0.0)
-            for k in range(len(self.views[0]))
-        ]
-        self._shown = np.moveaxis(np.stack(shown, axis=1), -1, 0).copy()
+        self._shown = shown.transpose(3, 0, 2, 1).copy()
         self._source, self._axes, self._scale = (
             np.array([[getattr(view, name) for view in of] for of in self.views])
             for name in ("source", "axes", "scale")
@@ -380,21 +370,29 @@ class TipFinder:
 
 def _lines(
     anatomy: Anatomy, wire_radius_mm: float, config: FluoroscopeConfig
-) -> tuple[list[View], tuple[list[np.ndarray], ...]]:
-    """Return the views of a C-arm, the middle of the vessel in its isocenter, and of the guiding catheter and of each
-    branch the points, tangents, usual distances of a tip from them, mm, and abscissae."""
+) -> tuple[list[View], dict[str, np.ndarray]]:
+    """Return the views of a C-arm, the middle of the vessel in its isocenter, and of the vertices of the guiding
+    catheter and of each branch, line after line, points, pixels in each view, tangents, usual distance of a tip, mm,
+    abscissae, and the first and the last vertex of their line."""
     lines, insertion = [branch.centerline for branch in anatomy.tree.branches], anatomy.insertion
     behind = np.linspace(-_CATHETER_MM, -0.5, 40)
-    points = [line.points for line in lines]
-    catheter = insertion.position + behind[:, None] * insertion.direction
-    isocenter = np.concatenate(points).mean(axis=0)
+    points = [insertion.position + behind[:, None] * insertion.direction, *(line.points for line in lines)]
+    isocenter = np.concatenate(points[1:]).mean(axis=0)
     views = [view_at(angles, isocenter, config.geometry) for angles in config.view_angles_deg[: 1 + config.biplane]]
-    radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
     # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
     wider = _UNCLAMPED if len(views) > 1 else 1.0
-    usual = [wider * np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
-    along = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
-    return views, ([catheter, *points], along, usual, [behind, *(line.abscissa for line in lines)])
+    radius = np.concatenate([np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)])
+    along = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(line) for line in points[1:])]
+    counts = [len(line) for line in points]
+    return views, {
+        "points": np.concatenate(points),
+        "shown": np.concatenate([np.stack([view.project(line) for view in views], axis=1) for line in points]),
+        "tangents": np.concatenate(along),
+        "sd": wider * np.maximum(radius - wire_radius_mm, 0.1) / np.sqrt(2),
+        "abscissa": np.concatenate([behind, *(line.abscissa for line in lines)]),
+        "first": np.repeat(np.cumsum(counts) - counts, counts),
+        "last": np.repeat(np.cumsum(counts) - 1, counts),
+    }
 
 
 def _dot(a: Float[np.ndarray, "*n k"], b: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n"]:
@@ -411,15 +409,17 @@ def make_c_arm(
     """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says. The seed is that of the pose
     in which a patient lies whose images are taken, and of these images' noise. Raises InputError for images of a wire
     in a catheter, or of a vessel that is not recognised in them."""
-    device = navigation.device
-    how: Any = {"config": config, "known_motion": navigation.known_motion, "registration_mm": registration_mm}
+    anatomy, device = navigation.anatomy, navigation.device
     if navigation.xray == "assumed":
-        return Fluoroscope(navigation.anatomy, device.tip_radius_mm, **how)
-    from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
-
-    if navigation.catheters:
+        arm: CArm = Fluoroscope(anatomy, device.tip_radius_mm, config=config)
+    elif navigation.catheters:
         names = ", ".join(catheter.name for catheter in navigation.catheters)
         raise InputError(
             f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
         )
-    return ImageFluoroscope(navigation.anatomy, device, seed=seed, **how)
+    else:
+        from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
+
+        arm = ImageFluoroscope(anatomy, device, config=config, seed=seed)
+    arm.known_motion, arm.registration_mm = navigation.known_motion, registration_mm
+    return arm

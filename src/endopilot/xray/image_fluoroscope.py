@@ -42,21 +42,14 @@ class ImageFluoroscope(CArm):
     """
 
     def __init__(
-        self,
-        anatomy: Anatomy,
-        device: Wire,
-        *,
-        config: FluoroscopeConfig | None = None,
-        seed: int = 0,
-        known_motion: Motion | None = None,
-        registration_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        self, anatomy: Anatomy, device: Wire, *, config: FluoroscopeConfig | None = None, seed: int = 0
     ) -> None:
         """Lay the patient on the table, inject contrast and register; NotRegistered if that fails.
 
         A coronary artery lies in a synthetic chest, any other vessel in water. The seed draws the pose, up to 5 mm and
         3° along and about each axis, and these images' noise; the errors of detection of `config` are not used.
         """
-        super().__init__(anatomy, known_motion, registration_mm)
+        super().__init__(anatomy)
         config, random = config or FluoroscopeConfig(), np.random.default_rng([seed, 0x706F7365])
         self.pose, self._angles_deg = Pose.draw(random), config.view_angles_deg[: 1 + config.biplane]
         image = ImageConfig(geometry=config.geometry)
