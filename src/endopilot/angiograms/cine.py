@@ -107,13 +107,8 @@ _HARMONISED_MM = 15.0
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """Collimator, wedge filter and cables.
-
-    Attributes:
-        edges: of the collimator: left, right, upper and lower; pixels.
-        field: share of the beam that the collimator lets through.
-        attenuation: of wedge filter and cables.
-    """
+    """The collimator's left, right, upper and lower edges, pixels, the share of the beam that it lets through, and the
+    attenuation of wedge filter and cables."""
 
     edges: tuple[int, int, int, int]
     field: Image
@@ -169,10 +164,8 @@ def shown(light: Image, beam: Beam) -> Image:
 
 def harmonised(light: Image, beam: Beam, pixel_mm: float, span: float) -> Image:
     """Return what the C-arm takes off the logarithm of the light: of its slow part what spans more than `span`, and
-    then the level that lies in the middle of the monitor's grey scale.
-
-    Bright lungs and a dark liver then fit a monitor, and fine details keep their contrast.
-    """
+    then the level that lies in the middle of the monitor's grey scale. Bright lungs and a dark liver then fit a
+    monitor, and fine details keep their contrast."""
     slow, inside = gaussian_filter(light, _HARMONISED_MM / pixel_mm, mode="nearest"), beam.field > 0.5
     low, high = np.percentile(slow[inside], (5, 95))
     pressed = np.float32(1 - span / max(high - low, span)) * slow

@@ -94,14 +94,8 @@ _SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd")
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The patients of a data set, and where everything stands.
-
-    Attributes:
-        sources: where each patient comes from: a folder of an anatomy, or a CT.
-        splits: of each: train, calibrate or test.
-        settings: what a resumed run must share with the run that it continues.
-        key: marks all of that.
-    """
+    """The patients of a data set, each of whom comes from a folder of an anatomy or a CT, and trains, calibrates or
+    tests, and where everything stands. A resumed run must share its `settings`, which the `key` marks."""
 
     output: Path
     config: AngiogramsConfig
@@ -123,10 +117,6 @@ class Layout:
         return [
             self.output / "cines" / f"{name}-{number:04d}" for name in self.names for number in range(self.config.cines)
         ]
-
-    def annotations(self, split: str) -> Path:
-        """Return the path of a split's COCO file."""
-        return self.output / "annotations" / f"{split}.json"
 
 
 def lay_out(sources: Sequence[Path], output: Path, stack: Stack, config: AngiogramsConfig) -> Layout:

@@ -148,13 +148,8 @@ _NAVIGATION_S = 45.0
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """Devices at each frame, in the vessel as CT shows it.
-
-    Attributes:
-        nodes: of each frame and device, from its tip on, LPS mm.
-        proximal: Δ (mm) and φ (rad) of each device.
-        redrawn: motions that could not be simulated.
-    """
+    """Devices at each frame, in the vessel as CT shows it: nodes of each from its tip on, LPS mm, and their Δ (mm) and
+    φ (rad); and how many motions were redrawn since they could not be simulated."""
 
     nodes: list[list[Float[np.ndarray, "_ 3"]]]
     proximal: Float[np.ndarray, "frames devices 2"]

@@ -39,12 +39,8 @@ _INLET_MM = 10.0
 
 @dataclass(frozen=True)
 class Injection:
-    """Contrast that is injected through the guiding catheter.
-
-    Attributes:
-        rate_ml_s: ml/s; what the vessel does not take flows back into the aorta.
-        ramp_s: time in which the rate rises and falls, s.
-    """
+    """Contrast that is injected through the guiding catheter, at a rate that rises and falls within `ramp_s`; what the
+    vessel does not take flows back into the aorta."""
 
     start_s: float
     duration_s: float
@@ -146,11 +142,8 @@ curvature's 95th percentile is 0.12–0.17 /mm in thirty real trees."""
 
 
 def grow(anatomy: Anatomy, flow: Flow, random: np.random.Generator) -> tuple[Places, Float[np.ndarray, "n"]]:
-    """Append fine branches to the flow's lines, and return them as small volumes.
-
-    Returns:
-        Places, LPS mm, and sizes, mm³: six for each point that was appended.
-    """
+    """Append fine branches to the flow's lines, and return them as small volumes: places, LPS mm, and sizes, mm³, six
+    for each point that was appended."""
     tree = anatomy.tree
     centre, places, sizes = tree.line.points.mean(axis=0), [np.zeros((0, 3))], [np.zeros(0)]
     leaves, lines = tree.leaves(), [np.flatnonzero(flow.branch == k) for k in range(len(tree.branches))]

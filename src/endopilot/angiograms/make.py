@@ -45,7 +45,8 @@ def describe(layout: Layout) -> None:
         folders = [folder for folder, record in zip(layout.cines, records, strict=True) if record["split"] == split]
         if folders:
             parts = (read_json(folder / COCO_FILE) for folder in folders)
-            write_json(layout.annotations(split), coco(parts, f"endopilot angiograms, split {split}"), indented=False)
+            path = layout.output / "annotations" / f"{split}.json"
+            write_json(path, coco(parts, f"endopilot angiograms, split {split}"), indented=False)
             frames = len(folders) * layout.config.frames
             counts[split] = {"patients": layout.splits.count(split), "cines": len(folders), "frames": frames}
     with writing(layout.output / SAMPLES_FILE) as partial:

@@ -137,11 +137,7 @@ class _Seen(NamedTuple):
 
 
 class TipFilter:
-    """Follows the tip of one device through the frames of a sequence.
-
-    Attributes:
-        grid: places of the tip.
-    """
+    """Follows the tip of one device, one of the places of a `grid`, through the frames of a sequence."""
 
     def __init__(self, tree: VesselTree, cameras: Sequence[Camera | View], config: LocateConfig | None = None) -> None:
         """Take the vessel and what sees it; `config` says what is known before the first frame."""
@@ -161,13 +157,8 @@ class TipFilter:
         self._seen: list[_Seen] = []
 
     def update(self, frame: int, lines: Sequence[Line | None]) -> TipLocation:
-        """Return where the tip is, by this frame and those before.
-
-        Args:
-            frame: number of the frame.
-            lines: for each camera the device's line, pixels (column, row), from its tip backwards; a single point is
-                the tip alone; None where the camera does not see it.
-        """
+        """Return where the tip is, by this frame and those before; a frame's number and lines are as `DeviceFrame` has
+        them."""
         if self._begun:
             self._predict(max(frame - self._frame, 1))
         else:
