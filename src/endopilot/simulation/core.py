@@ -58,15 +58,11 @@ def run_core(
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on rods and walls of one's own making; `made_of` is what else `make_simulation` takes.
 
-    Args:
-        initial: inserted length (mm) and rotation (rad) of each device before the first period.
-        control: mm/s and rad/s, or N and N·mm, as `actuation` says.
-        lanes: worlds stepped side by side by one thread: 1, 4 or 8.
-        push_limit_n: force at which the drive slips, N; where it pulls `pull_limit_n`, turns `torque_limit_n_mm`.
-
-    Returns:
-        The arrays of `_core.OUTPUTS`, with an axis of devices where they are of devices; `reason`: 0 fine, 1 not
-        finite, 2 not converged; `contacts`: the wall's force at each node and on the element behind it, N.
+    Devices begin at inserted lengths (mm) and rotations (rad); controls are mm/s and rad/s, or N and N·mm, as
+    `actuation` says. One thread steps 1, 4 or 8 `lanes` of worlds side by side. The drive slips at the limits where it
+    pushes and pulls, N, and turns, N·mm. Returned are the arrays of `_core.OUTPUTS`, with an axis of devices where they
+    are of devices; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`: the wall's force at each node and on
+    the element behind it, N.
     """
     limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
     worlds, samples, devices = len(control), control.shape[1], len(limits)
@@ -123,14 +119,10 @@ def make_simulation(
 ) -> Simulation:
     """Return worlds as the core has them; everything that is simulated comes through here.
 
-    Args:
-        rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
-        insertion: the point and the direction along which the base slides.
-        limits: where each drive slips: push (N), pull (N) and torque (N·mm).
-        push_limit_n: what all drives together can push with, N; it sizes the wall's stiffness.
-        loads: dead loads and springs.
-        approach: bring devices to their first inserted length from the ostium; else they start there, straight.
-        free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
+    Of the rod with tubes, the nodes alone count, and the drag. Each drive slips at its limits: push (N), pull (N) and
+    torque (N·mm); what all together can push with, N, sizes the wall's stiffness. Devices `approach` their first
+    inserted length from the ostium, else they start there, straight; nodes farther behind the insertion point than
+    `free_behind_mm` follow the drive.
     """
     core = core_for(config.processor)
     with gpu_errors(config.processor):

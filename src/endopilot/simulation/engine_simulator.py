@@ -7,20 +7,19 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from endopilot.anatomy.distance import sample
 from endopilot.errors import InputError
-from endopilot.progress import Advance
 from endopilot.simulation import core_state as at
 from endopilot.simulation.config import FREE_BEHIND_MM
 from endopilot.simulation.controls import free_wire_load
 from endopilot.simulation.core import insertion_arguments
 from endopilot.simulation.groups import Group, prepared
 from endopilot.simulation.kirchhoff_rod import NODE_MM, KirchhoffRod, PointWall
-from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.simulator import Simulator, Stepping
 from endopilot.simulation.trajectory import SimulatorState, Step
 
 _RESULTANT_MM = 2.0  # length of wire whose forces of the wall are added up, mm, as the core does
@@ -42,28 +41,20 @@ class EngineSimulator(Simulator):
         raise InputError("source: another engine's worlds are not copied; drive each from its start")
 
     def _run(
-        self,
-        group: Group,
-        control: Float[np.ndarray, "members samples devices 2"],
-        time_step: float,
-        steps: int,
-        *,
-        shape: bool = False,
-        advance: Advance | None = None,
-        worlds: Bool[np.ndarray, "worlds"] | None = None,
+        self, group: Group, control: Float[np.ndarray, "members samples devices 2"], how: Stepping
     ) -> dict[str, np.ndarray]:
         if not control.shape[1]:
-            begun = super()._run(group, control, time_step, steps, shape=shape, advance=advance)
+            begun = super()._run(group, control, how)
             self._begin(group)
             return begun
-        if worlds is not None:
+        if how.worlds is not None:
             raise InputError("worlds: some are given; the engine 'kirchhoff' drives all, leave them out")
         rows = []
         for velocity in control[:, :, 0].swapaxes(0, 1):
-            rows.append(self._driven(group, velocity, time_step * steps))
-            if advance is not None:
-                advance(len(velocity))
-        names = [*Step.__dataclass_fields__, *(("shape",) if shape else ())]
+            rows.append(self._driven(group, velocity, how.time_step * how.steps))
+            if how.advance is not None:
+                how.advance(len(velocity))
+        names = [*Step.__dataclass_fields__, *(("shape",) if how.record_shape else ())]
         return {name: np.stack([row[name] for row in rows], axis=1) for name in names}
 
     @cached_property

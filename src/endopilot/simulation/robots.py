@@ -23,7 +23,7 @@ class Recorder:
     def __init__(self, simulator: Simulator, period_s: float, *, record_shape: bool = False) -> None:
         """Begin where the worlds are now; `record_shape` records the positions of all nodes too."""
         self.simulator, self.period_s = simulator, period_s
-        self._set_up, self._start, self._began_s = simulator.set_up, simulator.proximal, simulator.time
+        self._begun = simulator._begun
         self._commands: list[np.ndarray] = []
         self._steps: list[Step] = []
         self._shapes: list[np.ndarray] | None = [] if record_shape else None
@@ -31,7 +31,7 @@ class Recorder:
     def step(self, control: ArrayLike) -> Step:
         """Drive every world for a period, as `Simulator.step` does."""
         self._steps.append(self.simulator.step(control, self.period_s))
-        self._commands.append(np.array(control, dtype=float).reshape(self._start.shape))
+        self._commands.append(np.array(control, dtype=float).reshape(self._begun[1].shape))
         if self._shapes is not None:
             self._shapes.append(self.simulator.position)
         return self._steps[-1]
@@ -44,9 +44,7 @@ class Recorder:
         recorded = {name: np.stack([getattr(step, name) for step in self._steps], axis=1) for name in names}
         if self._shapes is not None:
             recorded["shape"] = self.simulator._shown(np.stack(self._shapes, axis=1), recorded["inserted_length"])
-        return self.simulator._made(
-            self._set_up, self._start, np.stack(self._commands, axis=1), self.period_s, self._began_s, recorded
-        )
+        return self.simulator._made(self._begun, np.stack(self._commands, axis=1), self.period_s, recorded)
 
 
 Seed = Sequence[int]  # seed of one robot: of its gains, its jitter and its noise

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -42,6 +42,17 @@ _AT_ONCE = ThreadPoolExecutor(CORES)  # steps groups of worlds; the main thread'
 def _lanes(worlds: int) -> int:
     """Return how many worlds are stepped side by side where so many are; the bits are the same."""
     return LANES if worlds > _FEW else min(LANES, _FEW) if worlds > 1 else 1
+
+
+class Stepping(NamedTuple):
+    """How worlds, or those that are chosen, are driven: seconds of a time step, and time steps of a sample; whether the
+    positions of all nodes are recorded, and who is told of the samples of all worlds that are done."""
+
+    time_step: float
+    steps: int
+    record_shape: bool = False
+    advance: Advance | None = None
+    worlds: Bool[np.ndarray, "worlds"] | None = None
 
 
 class Simulator(Readout):
@@ -187,7 +198,7 @@ class Simulator(Readout):
                 sample_period=SAMPLE_PERIOD_S,
             )
             no_control = np.zeros((len(group.index), 0, self._devices, 2))
-            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample)
+            self._run(group, no_control, Stepping(self.config.time_step_s, self.config.steps_per_sample))
         resets = np.isin(np.arange(self.worlds), chosen)
         self._set_up = replace(
             self._set_up,
@@ -222,7 +233,7 @@ class Simulator(Readout):
             raise InputError(f"duration_s: {duration_s}; give a positive number of seconds")
         array = self._checked(control, duration_s, sequence=False)
         steps = self.config.steps_of(duration_s)
-        result = self._run_all(array, duration_s / steps, steps, worlds=worlds)
+        result = self._run_all(array, Stepping(duration_s / steps, steps, worlds=worlds))
         return Step(**{name: result[name][:, 0] for name in Step.__dataclass_fields__})
 
     def run(
@@ -254,21 +265,20 @@ class Simulator(Readout):
         if not 0 < period_s < np.inf:
             raise InputError(f"period_s: {period_s}; give a positive number of seconds")
         command = self._checked(control, period_s, sequence=True)
-        set_up, start, began_s = self._set_up, self.proximal, self.time
-        steps = self.config.steps_of(period_s)
-        result = self._run_all(command, period_s / steps, steps, record_shape=record_shape, advance=advance)
-        return self._made(set_up, start, command, period_s, began_s, result)
+        begun, steps = self._begun, self.config.steps_of(period_s)
+        result = self._run_all(command, Stepping(period_s / steps, steps, record_shape, advance))
+        return self._made(begun, command, period_s, result)
+
+    @property
+    def _begun(self) -> tuple[SimulationSetUp, Float[np.ndarray, "worlds devices 2"], Float[np.ndarray, "worlds"]]:
+        """What a recording that begins now is to know later: set-up, start and time."""
+        return self._set_up, self.proximal, self.time
 
     def _made(
-        self,
-        set_up: SimulationSetUp,
-        start: Float[np.ndarray, "worlds devices 2"],
-        command: Float[np.ndarray, "worlds samples devices 2"],
-        period_s: float,
-        began_s: Float[np.ndarray, "worlds"],
-        result: Mapping[str, np.ndarray],
+        self, begun: tuple[Any, ...], command: np.ndarray, period_s: float, result: Mapping[str, np.ndarray]
     ) -> Trajectory:
-        """Return what was recorded as a trajectory: worlds' starts, `time`, commands and the arrays of `Step`."""
+        """Return what was recorded as a trajectory, given how it began, commands and the arrays of `Step`."""
+        set_up, start, began_s = begun
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(
@@ -384,25 +394,15 @@ class Simulator(Readout):
             check_travel(begun + np.maximum(ahead, 0.0).sum(axis=1), self._longest)
         return array
 
-    def _run_all(
-        self,
-        control: Float[np.ndarray, "worlds samples devices 2"],
-        time_step: float,
-        steps: int,
-        *,
-        record_shape: bool = False,
-        advance: Advance | None = None,
-        worlds: Bool[np.ndarray, "worlds"] | None = None,
-    ) -> dict[str, np.ndarray]:
-        """Step worlds, all if none are chosen; from now on all are on their way."""
-        run = partial(self._run, time_step=time_step, steps=steps, shape=record_shape, advance=advance, worlds=worlds)
+    def _run_all(self, control: Float[np.ndarray, "worlds samples devices 2"], how: Stepping) -> dict[str, np.ndarray]:
+        """Step worlds; from now on all are on their way."""
         in_main = threading.current_thread() is threading.main_thread()
         one_by_one = self.config.threads == 1 or (in_main and control.shape[1] > 1)
         each = map if one_by_one or len(self._groups) == 1 else _AT_ONCE.map
-        results = list(each(run, self._groups, [control[group.index] for group in self._groups]))
+        results = list(each(lambda group: self._run(group, control[group.index], how), self._groups))
         if control.size and not np.isnan(self._set_up.initial).all():
             self._go_on_their_way()
-        if record_shape:  # of the wires that were needed
+        if how.record_shape:  # of the wires that were needed
             shapes, inserted = ([result[name] for result in results] for name in ("shape", "inserted_length"))
             for result, shape in zip(results, self._needed_nodes(shapes, inserted), strict=True):
                 result["shape"] = shape
@@ -433,24 +433,16 @@ class Simulator(Readout):
         return [np.pad(shape, width, constant_values=np.nan) for shape, width in zip(kept, beyond, strict=True)]
 
     def _run(
-        self,
-        group: Group,
-        control: Float[np.ndarray, "members samples devices 2"],
-        time_step: float,
-        steps: int,
-        *,
-        shape: bool = False,
-        advance: Advance | None = None,
-        worlds: Bool[np.ndarray, "worlds"] | None = None,
+        self, group: Group, control: Float[np.ndarray, "members samples devices 2"], how: Stepping
     ) -> dict[str, np.ndarray]:
-        if worlds is not None and self.config.friction_along:  # it is scaled in all of them
+        if how.worlds is not None and self.config.friction_along:  # it is scaled in all of them
             raise InputError("worlds: some are given where friction differs along the vessel; leave them out")
-        chosen = np.arange(len(group.index)) if worlds is None else np.flatnonzero(worlds[group.index])
+        chosen = np.arange(len(group.index)) if how.worlds is None else np.flatnonzero(how.worlds[group.index])
         run = partial(
             group.simulation.run,
             force_driven=self._set_up.actuation == "force",
-            time_step=time_step,
-            record_shape=shape,
+            time_step=how.time_step,
+            record_shape=how.record_shape,
             record_attitude=False,
             threads=self.config.threads_for(len(group.index), LANES),
             lanes=_lanes(len(chosen)),
@@ -458,8 +450,8 @@ class Simulator(Readout):
         )
         with gpu_errors(self.config.processor):
             if self.config.friction_along and control.shape[1]:
-                return run_along(group, control, steps, self.config.friction_along, run, advance)
-            return run(control=control, steps_per_sample=steps, progress=advance)
+                return run_along(group, control, how.steps, self.config.friction_along, run, how.advance)
+            return run(control=control, steps_per_sample=how.steps, progress=how.advance)
 
     def _go_on_their_way(self) -> None:
         """Note that the worlds are no longer at their start: what follows is not replayed from there."""
