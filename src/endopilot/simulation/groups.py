@@ -345,15 +345,15 @@ class Readout:
 
     def _placements(self, times: Float[np.ndarray, "worlds samples"]) -> Float[np.ndarray, "worlds samples 3 4"]:
         still, parts = np.eye(3, 4), []
-        for group, at in self._of_groups(times):
+        for group, at in zip(self._groups, self._of_groups(times), strict=True):
             if group.motion is None:
                 parts.append(np.tile(still, (*at.shape, 1, 1)))
             else:
                 parts.append(group.motion.placements(np.ascontiguousarray(at.ravel()))[0].reshape(*at.shape, 3, 4))
         return self._merge(parts)
 
-    def _of_groups(self, values: np.ndarray) -> list[tuple[Group, np.ndarray]]:
-        return [(group, values[group.index]) for group in self._groups]
+    def _of_groups(self, values: np.ndarray) -> list[np.ndarray]:
+        return [values[group.index] for group in self._groups]
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)[self._rows]

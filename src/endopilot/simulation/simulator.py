@@ -286,7 +286,7 @@ class Simulator(Readout):
             period_s=period_s,
             start=start,
             command=command,
-            tip=self._projected([each for _, each in self._of_groups(result["tip_position"])]),
+            tip=self._projected(self._of_groups(result["tip_position"])),
             reason=self.reason,
             shape=result.get("shape"),
             vessel_to_laboratory=None if set_up.motion is None else self._placements(times),
@@ -399,7 +399,7 @@ class Simulator(Readout):
         in_main = threading.current_thread() is threading.main_thread()
         one_by_one = self.config.threads == 1 or (in_main and control.shape[1] > 1)
         each = map if one_by_one or len(self._groups) == 1 else _AT_ONCE.map
-        results = list(each(lambda group: self._run(group, control[group.index], how), self._groups))
+        results = list(each(self._run, self._groups, self._of_groups(control), [how] * len(self._groups)))
         if control.size and not np.isnan(self._set_up.initial).all():
             self._go_on_their_way()
         if how.record_shape:  # of the wires that were needed
@@ -414,8 +414,7 @@ class Simulator(Readout):
         inserted: Float[np.ndarray, "worlds samples devices"],
     ) -> Float[np.ndarray, "worlds samples nodes 3"]:
         """Return shapes that were read step by step as `run` records them."""
-        parts = [[values for _, values in self._of_groups(each)] for each in (shape, inserted)]
-        return self._merge(self._needed_nodes(*parts))
+        return self._merge(self._needed_nodes(self._of_groups(shape), self._of_groups(inserted)))
 
     def _needed_nodes(
         self,

@@ -13,7 +13,7 @@ suffix                   content
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -207,7 +207,14 @@ class Trajectory(Step):
 
     def samples(self, chosen: slice) -> Trajectory:
         """Return the trajectory with some of its samples; the first of them must be kept for it to be replayed."""
-        return self._each(lambda values: values[:, chosen])
+        kept: dict[str, Any] = {
+            each.name: value[:, chosen]
+            for each in fields(self)
+            if each.name not in ("start", "reason") and isinstance(value := getattr(self, each.name), np.ndarray)
+        }
+        tip = TipProjection(**{name: each[:, chosen] for name, each in vars(self.tip).items()})
+        columns = {name: each[:, chosen] for name, each in self.columns.items()}
+        return replace(self, tip=tip, columns=columns, **kept)
 
     def every(self, count: int) -> Trajectory:
         """Return the trajectory with every so many-th sample: commands and controls are means over its periods."""
@@ -226,15 +233,6 @@ class Trajectory(Step):
             iterations=whole(self.iterations).mean(axis=2),
             node_iterations=whole(self.node_iterations).sum(axis=2),
         )
-
-    def _each(self, take: Callable[[np.ndarray], np.ndarray]) -> Trajectory:
-        chosen: dict[str, Any] = {
-            each.name: take(value)
-            for each in fields(self)
-            if each.name not in ("start", "reason") and isinstance(value := getattr(self, each.name), np.ndarray)
-        }
-        tip = TipProjection(**{name: take(each) for name, each in vars(self.tip).items()})
-        return replace(self, tip=tip, columns={name: take(each) for name, each in self.columns.items()}, **chosen)
 
 
 def trajectory_suffix(path: Path | str, *, shape: bool) -> str:
