@@ -110,12 +110,11 @@ def locate_in_images(
             advance()
     clear = [_is_clear(detector.grid, *each, photons) for each in zip(views, dark, strict=True)]
     found = _followed(detector, seen, clear, cines[0].times_s, config)
+    project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
     for frame, one in enumerate(found):
         # Where heart and breath have taken the vessel is a guess in frames without contrast: no tip is sure there.
         if frame not in known and one.status == "found":
-            found[frame] = replace(one, status="ambiguous")
-    project, tips = TipProjector(anatomy.tree, anatomy.insertion), []
-    for frame, one in enumerate(found):
+            one = replace(one, status="ambiguous")
         views[frame] = [replace(view, source=view.source - one.shift) for view in views[frame]]
         moved = laid[frame][0].move(one.position + one.shift, isocenter) - one.position
         at = project(one.position[None])

@@ -24,17 +24,7 @@ from endopilot.settings import public
 from endopilot.types import Anatomy, VesselTree
 from endopilot.xray.camera import Camera
 from endopilot.xray.carm import Places, Pose, Vector, View
-from endopilot.xray.line_observations import (
-    DeviceFrame,
-    Line,
-    Observations,
-    SeenLine,
-    joined,
-    observe,
-    see,
-    shift_onto,
-    shown_by,
-)
+from endopilot.xray.line_observations import DeviceFrame, Line, Observations, SeenLine, shift_onto, shown_by
 from endopilot.xray.tip_posterior import LocateConfig, Status, TipEstimate, Told, VesselGrid
 
 _STEP_MM = 1.0
@@ -169,7 +159,7 @@ class TipFilter:
         share = np.exp(self._log)
         base = share @ self._mean
         pairs, way = zip(self._cameras, lines, strict=True), self._moved(base)
-        seen = [see(self.grid, camera, line, way) for camera, line in pairs if line is not None]
+        seen = [SeenLine.of(self.grid, camera, line, way) for camera, line in pairs if line is not None]
         everywhere = np.arange(len(self._log))
         score = self._log + self._compare(seen, everywhere, base, rounds=0)[0].log_density
         best = np.argsort(-score, kind="stable")[:_MOST]
@@ -244,13 +234,13 @@ class TipFilter:
     ) -> tuple[_Fit, Observations, Int[np.ndarray, "m"]]:
         """Return what lines say of some places of the tip, and how many of their points lie before the root. At first
         the ends alone are compared; then, so many times, the points with the way as it is moved by then."""
-        parts = [observe(self.grid, one, places, None) for one in seen]
-        rows = joined([part for part, _ in parts])
+        parts = [one.observe(self.grid, places, None) for one in seen]
+        rows = Observations.joined([part for part, _ in parts])
         fit = self._fit(places, rows, base)
         moved = [np.repeat(fit.moved[:, :1], len(one.at), axis=1) for one in seen]
         for _ in range(rounds):
-            parts = [observe(self.grid, one, places, shift) for one, shift in zip(seen, moved, strict=True)]
-            rows = joined([part for part, _ in parts])
+            parts = [one.observe(self.grid, places, shift) for one, shift in zip(seen, moved, strict=True)]
+            rows = Observations.joined([part for part, _ in parts])
             fit = self._fit(places, rows, base)
             bounds = np.cumsum([part.value.shape[1] for part, _ in parts])[:-1]
             of_lines = zip(seen, np.split(fit.moved, bounds, axis=1), strict=True)
