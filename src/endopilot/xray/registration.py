@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -107,9 +107,10 @@ def register(
     def maps(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "1 3 4"]:
         return Pose.of_vector(pose).affine(isocenter)[None]
 
-    sought = _Sought(maps, laid, _PRIOR, (laid - _FAR * _PRIOR, laid + _FAR * _PRIOR))
+    bounds = laid - _FAR * _PRIOR, laid + _FAR * _PRIOR
+    fit = _Fit(maps, laid, _PRIOR, bounds, lumen, views, config or ImageConfig())
     levels = _LEVELS if start is None else _LEVELS[1:]
-    found, covariance, correlation, failure = _fit(sought, lumen, views, [contrasted], before, config, levels)
+    found, covariance, correlation, failure = fit.best([contrasted], before, levels)
     # How far off a vessel lies that was laid by its images says nothing against it.
     far = float(np.abs((found - laid) / _PRIOR)[: 6 if start is None else 3].max()) + 1e-2
     if not failure and far > _FAR:
@@ -145,10 +146,9 @@ def register_motion(
         core = motion(deviations).core(np.asarray(anatomy.insertion.position))
         return core.placements(np.array(RUN_TIMES_S))[0]
 
-    sought = _Sought(maps, np.zeros(len(names)), np.ones(len(names)), bounds)
-    found, covariance, correlation, failure = _fit(
-        sought, sampled_lumen(anatomy), views, contrasted, before, config, _MOTION_LEVELS
-    )
+    none, one = np.zeros(len(names)), np.ones(len(names))
+    fit = _Fit(maps, none, one, bounds, sampled_lumen(anatomy), views, config or ImageConfig())
+    found, covariance, correlation, failure = fit.best(contrasted, before, _MOTION_LEVELS)
     return Registration(Pose(), covariance, correlation, failure, motion(found))
 
 
@@ -188,58 +188,41 @@ def lay(anatomy: Anatomy, views: Sequence[View], contrasted: Images, before: Ima
     return Pose(translation_mm=shift)
 
 
-class _Sought(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Fit:
     """Numbers that are sought, laid so with these standard deviations before any image, and the affine maps of the CT's
-    points, LPS mm, that they make at each moment."""
+    points, LPS mm, that they make at each moment; and the comparison of the lumen, projected so, with what contrast
+    added to each image then: `averaged` pixels along a side are one, and the blur is in these."""
 
     maps: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "moments 3 4"]]
     laid: Float[np.ndarray, "k"]
     sd: Float[np.ndarray, "k"]
     bounds: tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]
-
-
-_Lumen = tuple[Places, Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
-
-
-def _fit(
-    sought: _Sought,
-    lumen: _Lumen,
-    views: Sequence[View],
-    contrasted: Sequence[Images],
-    before: Images,
-    config: ImageConfig | None,
-    levels: Sequence[tuple[int, float]],
-) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k k"], float, str]:
-    """Return the numbers that are sought, their covariance, the correlation, and why not to believe them."""
-    config, found, covariance = config or ImageConfig(), sought.laid, np.diag(sought.sd**2)
-    correlation = 0.0
-    for averaged, blur in levels:
-        observed = [observed_contrast(images, before, averaged, blur, config) for images in contrasted]
-        if not any(np.ptp(image) for images in observed for image in images):
-            return found, covariance, 0.0, "images with and without contrast are the same; inject contrast"
-        points, size, along = (part[:: averaged // 2] for part in lumen)  # coarse images need fewer points
-        fewer = points, size * (lumen[1].sum() / size.sum()), along
-        level = _Comparison(sought, fewer, views, observed, averaged, blur, config)
-        slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
-        how = {"bounds": sought.bounds, "x_scale": sought.sd, "max_nfev": 10, "xtol": 1e-4, "ftol": 1e-4}
-        fit = least_squares(level.residuals, found, slope, **how)
-        found, correlation, covariance = fit.x, level.correlation(fit.x), level.covariance(fit.jac, fit.fun)
-    disagrees = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
-    return found, covariance, correlation, "" if correlation >= _AGREES else disagrees
-
-
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """The comparison of the projected lumen with what contrast added to each image at each moment: `averaged` pixels
-    along a side are one, and the blur is in these."""
-
-    sought: _Sought
-    lumen: _Lumen
+    lumen: tuple[Places, Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
     views: Sequence[View]
-    observed: Sequence[Sequence[np.ndarray]]
-    averaged: int
-    blur: float
     config: ImageConfig
+    observed: Sequence[Sequence[np.ndarray]] = ()
+    averaged: int = 1
+    blur: float = 0.0
+
+    def best(
+        self, contrasted: Sequence[Images], before: Images, levels: Sequence[tuple[int, float]]
+    ) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k k"], float, str]:
+        """Return the numbers that are sought, their covariance, the correlation, and why not to believe them."""
+        found, covariance, correlation = self.laid, np.diag(self.sd**2), 0.0
+        for averaged, blur in levels:
+            observed = [observed_contrast(images, before, averaged, blur, self.config) for images in contrasted]
+            if not any(np.ptp(image) for images in observed for image in images):
+                return found, covariance, 0.0, "images with and without contrast are the same; inject contrast"
+            points, size, along = (part[:: averaged // 2] for part in self.lumen)  # coarse images need fewer points
+            fewer = points, size * (self.lumen[1].sum() / size.sum()), along
+            level = replace(self, lumen=fewer, observed=observed, averaged=averaged, blur=blur)
+            slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
+            how = {"bounds": self.bounds, "x_scale": self.sd, "max_nfev": 10, "xtol": 1e-4, "ftol": 1e-4}
+            fit = least_squares(level.residuals, found, slope, **how)
+            found, correlation, covariance = fit.x, level.correlation(fit.x), level.covariance(fit.jac, fit.fun)
+        disagrees = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
+        return found, covariance, correlation, "" if correlation >= _AGREES else disagrees
 
     def fitted(self, sought: Float[np.ndarray, "k"]) -> list[list[tuple[np.ndarray, np.ndarray, float]]]:
         """Return for each image what is expected, what is observed, and how strong the contrast shows.
@@ -249,7 +232,7 @@ class _Comparison:
         """
         (points, size, along), pixels = self.lumen, self.config.pixels // self.averaged
         fillings, found = (size, size * along) if along.any() else (size,), []
-        for placed, observed in zip(self.sought.maps(sought), self.observed, strict=True):
+        for placed, observed in zip(self.maps(sought), self.observed, strict=True):
             found.append([])
             for view, theirs in zip(self.views, observed, strict=True):
                 shadow = Shadow(view.magnified(1 / self.averaged), pixels, points, placed)
@@ -274,7 +257,7 @@ class _Comparison:
         fitted = [image for moment in self.fitted(sought) for image in moment]
         off = np.concatenate([((ours - theirs) / (strength * full)).ravel() for ours, theirs, strength in fitted])
         soft = np.sign(off) * np.sqrt(2 * (np.sqrt(1 + off**2) - 1))  # scipy's loss would soften the prior too
-        return np.concatenate([soft / self._together, (sought - self.sought.laid) / self.sought.sd])
+        return np.concatenate([soft / self._together, (sought - self.laid) / self.sd])
 
     @property
     def _together(self) -> float:
@@ -283,7 +266,7 @@ class _Comparison:
 
     def slope(self, sought: Float[np.ndarray, "k"]) -> Float[np.ndarray, "n k"]:
         """Return the derivative of the residuals by what is sought."""
-        steps = _STEP_SHARE * self.averaged * np.diag(self.sought.sd)
+        steps = _STEP_SHARE * self.averaged * np.diag(self.sd)
         columns = [(self.residuals(sought + step) - self.residuals(sought - step)) / (2 * step.sum()) for step in steps]
         return np.stack(columns, axis=-1)
 
@@ -292,7 +275,7 @@ class _Comparison:
         slope, residual = (part[: -slope.shape[1]] for part in (slope, residual))
         near = np.abs(slope).max(axis=1) >= _FELT * np.abs(slope).max()
         misfit = float(np.sqrt(np.mean(residual[near] ** 2))) * self._together
-        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sought.sd**-2.0))
+        return np.linalg.inv(slope.T @ slope / misfit**2 + np.diag(self.sd**-2.0))
 
     def correlation(self, sought: Float[np.ndarray, "k"]) -> float:
         """Return the correlation of what was expected and observed around the vessel, at the worst moment."""
@@ -310,7 +293,7 @@ class _Comparison:
 def observed_contrast(
     contrasted: Images, before: Images, averaged: int, blur: float, config: ImageConfig
 ) -> list[np.ndarray]:
-    """Return what contrast added to each image, as `_Comparison` takes it; arguments as `register` has."""
+    """Return what contrast added to each image, as `_Fit` compares it; arguments as `register` has."""
     reach, added = config.scatter_mm / config.geometry.pixel_mm / averaged, []
     for pair in zip(contrasted, before, strict=True):
         light, empty = (downscale_local_mean(np.exp(image), (averaged, averaged)) for image in pair)
