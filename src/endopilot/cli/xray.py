@@ -19,7 +19,7 @@ from endopilot.imaging.volume import read_volume
 from endopilot.runs import Existing, OutputFolder, Page, Picture, Table
 from endopilot.types import Anatomy
 from endopilot.xray.camera import read_camera
-from endopilot.xray.frames import read_frames, write_locations
+from endopilot.xray.frames import draw_locations, read_frames, write_locations, write_page
 from endopilot.xray.take_image import TakeImageConfig, take_image
 from endopilot.xray.tip_filter import LocateConfig, TipLocation, locate
 
@@ -114,8 +114,6 @@ def locate_command(
     count = {status: sum(one.status == status for one in found) for status in ("found", "ambiguous", "not found")}
     counted = ", ".join(f"{number} {status}" for status, number in count.items())
     if picture is not None or page is not None:
-        from endopilot.xray.frames import draw_locations, write_page  # matplotlib is slow to import
-
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "frames.png" if picture is None else picture
             draw_locations(vessel, found, path, **drawn)
