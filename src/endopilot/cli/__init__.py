@@ -59,7 +59,7 @@ _TOGETHER = {
     "navigation": "difficulty plan advise",
     "xray": "xray locate angiograms",
     "robots": "replay calibrate",
-    "servers": "cockpit drive",
+    "cockpit": "cockpit drive",
     "checks": "verify devices sample completion info",
 }
 """Modules of several commands that import about the same; others have a module of their own name, or are `_STAGES`."""
