@@ -13,6 +13,7 @@ import pytest
 from bend import vessel
 
 from endopilot.devices.device import read_wire
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.groups import Readout
@@ -128,6 +129,8 @@ def test_lanes_that_wait_for_a_slower_world_count_as_evaluations(anatomy: Anatom
     assert alike.evaluations(step) == 2 * 8 * 100
     slow = replace(step, node_iterations=np.array([1000.0, *[10.0] * 8]))
     assert alike.evaluations(slow) == 8 * 1000
+    pair = Simulator(anatomy, Stack.of(DEVICE, "microcatheter-2.4f"), worlds=9)  # measured: as long a node
+    assert pair.evaluations(step) == alike.evaluations(step)
     for few in (1, 4):
         moved = replace(step, node_iterations=np.where(np.arange(9) < few, 1000.0, 0.0))
         assert alike.evaluations(moved) == 4 * 1000

@@ -307,7 +307,7 @@ class Simulator(Readout):
             of = of[of > 0]
             pack = _PACK if len(of) > _FEW else _FEW
             spent += pack * max(-(-len(of) // pack) * of.mean(), of.max()) if len(of) else 0.0
-        return float(self._devices * spent)
+        return float(spent)
 
     @property
     def state(self) -> SimulatorState:
