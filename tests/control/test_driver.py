@@ -40,6 +40,7 @@ def test_a_motion_places_then_turns_then_retracts_then_pushes(side_branch) -> No
     assert (control[:placed, WIRE, 0] > 0).all() and not control[:, WIRE, 1].any()
     begun = side_branch.start_inserted_length_mm
     assert begun + control[:placed, WIRE, 0].sum() * DECISION_PERIOD_S == pytest.approx(16.0, abs=1.1)
+    assert placed == 2  # 14 mm at 20 mm/s; what turns back where slack is felt takes longer
     assert control[placed, WIRE, 0] * DECISION_PERIOD_S == pytest.approx(-2.0)
     assert (control[placed + 1 :, WIRE, 0] > 0).all()
     turned = outcome.controls_of(0)
@@ -71,6 +72,14 @@ def test_a_wire_that_folds_on_its_way_to_its_place_is_given_up(side_branch) -> N
     """The place lies beyond the vessel's end."""
     outcome = drive(side_branch, Row(at=(50.0,)), 22.5)
     assert outcome.halt == ["stalled"] and outcome.slack[0] > 15.0 and outcome.periods[0] < 60
+
+
+def test_a_wire_that_hardly_is_does_not_hold_the_others_back(side_branch) -> None:
+    belief = Belief(side_branch, [World(), World(tip_stiffness_factor=0.8)], BeliefConfig(members=2))
+    trials = Trials.of(side_branch, belief.kinds, 1, like=belief.simulator)
+    for unlikely, counts in ((0.04, False), (0.06, True)):
+        trials.put(np.arange(2), belief.simulator, np.array([1 - unlikely, unlikely]))
+        assert trials.all(np.array([True, False])).tolist() == [not counts]
 
 
 def test_a_wire_slows_down_before_the_target_and_stops_there(side_branch) -> None:

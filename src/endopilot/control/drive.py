@@ -230,6 +230,7 @@ class Driver:
         self._trials, self._motions, self._goal, self._limits, self._config = trials, motions, goal, limits, config
         self._step, self._alone = np.zeros(trials.count, dtype=int), trials.devices == 1
         self._turn, self._back = motions.turn_rad.copy(), motions.back_mm.copy()
+        self._towards = np.sign(np.nan_to_num(self._to_place()))
         self._follows = np.zeros(trials.count, dtype=bool)
         self._behind = np.minimum(motions.follow_mm, config.behind_mm)
         self._halt = np.full(trials.count, "late", dtype=object)
@@ -305,13 +306,18 @@ class Driver:
         self._back = np.where(trials.still, self._back, self._back - back * DECISION_PERIOD_S)
         return control
 
-    def _place(self) -> tuple[Control, Bool[np.ndarray, "trials"]]:
-        """Return what brings devices to their places, and which are there, or have taken too long."""
-        trials, motions, fastest = self._trials, self._motions, 2 * self._config.speed_mm_s
+    def _to_place(self) -> Each:
+        """Return how far the tips that are placed are from their places, mm; NaN of those that stay."""
         guide = WIRE if self._alone else CATHETER
-        error = motions.at_mm - trials.mean(trials.tips.abscissa[:, guide])
-        moves = np.abs(error) > _AT_MM  # not where it stays: NaN
-        speed = np.where(moves, np.clip(error / (2 * DECISION_PERIOD_S), -fastest, fastest), 0.0)
+        return self._motions.at_mm - self._trials.mean(self._trials.tips.abscissa[:, guide])
+
+    def _place(self) -> tuple[Control, Bool[np.ndarray, "trials"]]:
+        """Return what brings devices towards their places, and which are there, or past them: none turns back, since
+        slack would let it hunt."""
+        trials, motions, fastest = self._trials, self._motions, 2 * self._config.speed_mm_s
+        left = np.nan_to_num(self._to_place() * self._towards)
+        moves = left > _AT_MM
+        speed = self._towards * np.clip(left / DECISION_PERIOD_S, self._config.speed_mm_s / 2, fastest) * moves
         if self._alone:
             return trials.control(speed), ~moves
         gap = np.maximum(trials.inserted(CATHETER) + speed * DECISION_PERIOD_S + motions.lead_mm, 0.0)
