@@ -13,7 +13,8 @@ import pytest
 from endopilot.belief.belief import Belief
 from endopilot.belief.thought import Budget, OutOfBudgetError
 from endopilot.belief.vessels import SharedVessels
-from endopilot.control.agent import OraclePolicy
+from endopilot.control.agent import AgentPolicy, OraclePolicy
+from endopilot.control.drive import Outcome
 from endopilot.control.set_up import describe_halt
 from endopilot.control.trials import drive_period
 from endopilot.navigation.loop import NavigationLoop
@@ -62,6 +63,41 @@ def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) 
     course = policy.find_course(20.0)
     assert course.reached == 0.0 and course.force.max(initial=0.0) <= tight.force_limit_n
     assert "on the wall; give a larger force_limit_n" in policy.halt
+
+
+def test_a_wire_that_lies_beyond_its_target_is_pulled_back(side_branch) -> None:
+    """Motions are drawn about the target then, however far beyond a straight push would come."""
+    short = replace(
+        side_branch, target=replace(side_branch.target, branch=0, abscissa=8.0), start_inserted_length_mm=19
+    )
+    policy = OraclePolicy(config=QUICK)
+    policy.start(short, 0)
+    course = policy.find_course(20.0)
+    assert course.reached == 1.0 and course.control[:, 0, 0].min() < 0
+    assert policy._search._hard > 15.0 and policy._search._obstacle(8.0)[0] == 8.0
+
+
+def test_what_all_wires_say_of_a_motion_corrects_what_the_likeliest_says(side_branch) -> None:
+    """Motions that keep within a tight limit with the likeliest wire do not with others, and are cheap no longer."""
+    policy = OraclePolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    needed = float(policy.find_course(20.0).force.max())
+    agent, corrected = AgentPolicy(QUICK), 0
+    agent.start(replace(side_branch, force_limit_n=0.9 * needed), 0)
+    follow = agent._search._follow
+
+    def noted(outcome: Outcome, *rest: Any) -> bool:
+        nonlocal corrected
+        said, cost = outcome.share.copy(), outcome.cost(1.0)
+        passed = follow(outcome, *rest)
+        changed = outcome.share != said
+        corrected += int(changed.sum())
+        assert (outcome.share[changed] == 0).all() and (outcome.cost(1.0)[changed] > cost[changed]).all()
+        return passed
+
+    agent._search._follow = noted
+    agent.find_course(20.0)
+    assert corrected > 10
 
 
 def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:

@@ -34,16 +34,16 @@ class AgentConfig:
     off_course_mm: Positive = 2.5
     """Another course is searched when the likeliest tip is this far along the centerline from where it should be, mm.
     """
-    tries: Annotated[int, Within(1, 100)] = 3
+    tries: Annotated[int, Within(1, 100)] = 20
     """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
     losses: Annotated[int, Within(1, 100)] = 4
     """Times that the devices may be lost, after which the agent gives up: each time another belief was sought."""
     horizon_mm: Positive | None = None
     """A course may end when it leads this far on, mm, and is searched on from there; all the way if not given."""
     evaluations: Annotated[int, Within(1, 10**15)] = 300_000_000
-    """Evaluations of nodes (Newton's iterations times active nodes) that a search may take, some 30 s of a core; it
+    """Evaluations of nodes (Newton's iterations times active nodes) that a search may take, some 20 s of a core; it
     then ends with the course that it has."""
-    decision_evaluations: Annotated[int, Within(1, 10**15)] = 3_500_000
+    decision_evaluations: Annotated[int, Within(1, 10**15)] = 6_000_000
     """Those that a decision waits for, some 0.4 s of a core. A longer search goes on at the next decisions; the devices
     follow the course as far as it is known, and rest then."""
     decision_s: Positive | None = None
@@ -98,7 +98,6 @@ IN_CATHETER = AgentConfig(
         lost_across_radii=0.5,
     ),
     off_course_mm=3.0,
-    tries=2,
 )
 """Settings of an agent of a wire in a catheter."""
 _WAYS = 4.0
@@ -108,7 +107,6 @@ HURRIED = replace(
     IN_CATHETER,
     search=replace(IN_CATHETER.search, together=True, longest_s=10.0),
     belief=replace(IN_CATHETER.belief, copies=32),
-    tries=20,
     losses=20,
     horizon_mm=60.0,
     most_exposures=100,

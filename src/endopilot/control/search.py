@@ -214,7 +214,10 @@ class Search:
             best, costs, trials = Motions(*(each[kept] for each in tried)), costs[kept], self._trials_of(row)
 
     def _follow(self, outcome: Outcome, goal: Goal, row: Row, force_n: float, number: int = 0) -> bool:
-        """Let the course do what the cheapest trial of a round did; return whether it passed the place or came on."""
+        """Let the course do what the cheapest trial of a round did; return whether it passed the place or came on.
+
+        What all wires made of trials that did not is written into the outcome: the next round is drawn near the best.
+        """
         course, limit_n, agree = self._course, self._navigation.force_limit_n, row.agrees(number)
         gentle = outcome.force <= force_n
         passes = gentle & (outcome.share >= agree - ROUNDING)
@@ -225,6 +228,9 @@ class Search:
             if gentle_still and there.sum() > 0 and (goal.agree < 1 or there.sum() >= agree - ROUNDING):
                 course.weight = there / there.sum()
                 return True
+            outcome.share[trial] = there.sum() if gentle_still else 0.0
+            pressed = [row.force[course.counted].max() for row in course.rows[len(self._kept.rows) :]]
+            outcome.force[trial] = max(pressed, default=0.0)
         course.restore(self._kept)
         if row.draws is None or not gentle.any():
             return False
@@ -245,13 +251,14 @@ class Search:
     def _obstacle(self, place: float) -> tuple[float, float]:
         """Return what lies in the way of a place, and the steps in which devices are placed about it, mm.
 
-        That is the fork before the place, unless it is well behind, or where the straight push came to.
+        That is the fork before the place, unless it is well behind, or where the straight push came to; where devices
+        are too far in, the place itself.
         """
         route = self.route
         near = float(route.junctions[route.junctions < place].max(initial=0.0))
         width = 2 * float(route.radius(np.array([near]))[0])
         obstacle = min(near, self._hard) if near > max(self._here - width, 0.0) else self._hard
-        obstacle = obstacle if np.isfinite(obstacle) else near
+        obstacle = min(obstacle, place) if np.isfinite(obstacle) else near
         return obstacle, stand_off(route, obstacle, self.config.lead_mm)
 
     @property

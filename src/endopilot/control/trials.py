@@ -129,8 +129,8 @@ class Trials:
 
     @property
     def counted(self) -> Bool[np.ndarray, "wires"]:
-        """Which wires count."""
-        return self.weight > 0
+        """Which wires count: those of a weight above 5 %."""
+        return self.weight > 0.05
 
     def _see(self) -> tuple[Float[np.ndarray, "worlds devices 2"], TipProjection]:
         """Return where proximal ends and tips are, which is asked of the simulator once."""
