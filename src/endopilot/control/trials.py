@@ -68,7 +68,7 @@ class Trials:
         simulator: the worlds.
         wires, count, devices: numbers of wires, of trials, and of devices in a stack.
         fastest: translation (mm/s) and rotation (rad/s) of the wire's drive at most.
-        weight: how likely each wire is; one of weight 0 goes along and does not count.
+        weight: how likely each wire is; one of 5 % or less goes along and does not count.
         still: which trials stand still, whatever they are driven to do: no time passes for them.
         rows: what they have done, period by period.
     """
